@@ -3,7 +3,7 @@
 Counted is what the algorithm cannot do without, so every fraction of a peak is a lower bound: real additions,
 subtractions, multiplications, comparisons (a fused multiply-add is two), and bytes requested of memory, cached or not.
 
-* node test (kernels/traversal): four child pairs load four records of 32 bytes, pose four boxes and compare each pair:
+* node test (search/item.py): four child pairs load four records of 32 bytes, pose four boxes and compare each pair:
   2 (45 + 39) + 4 * 22 = 256, so 64 operations and 32 bytes a test.
 * triangle test (kernels/triangle/float32_filter.py): 2 corner triples in 16 bytes, 6 vertices of 16; 72 operations to
   scale and pose corners, 68 for a plane and three signs, where most pairs end. An intersecting pair takes a second

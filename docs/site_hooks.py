@@ -1,4 +1,4 @@
-"""What turns pages that read well in a repository into a site: files that they link to outside docs/ become pages."""
+"""Hooks of the site: files outside docs/ that pages link to become pages."""
 
 import posixpath
 import re

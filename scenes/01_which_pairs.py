@@ -1,4 +1,4 @@
-"""Which pairs meet, and where: python scenes/01_which_pairs.py (docs/howto_pairs.md)."""
+"""Intersecting pairs and their contacts: python scenes/01_which_pairs.py (docs/howto_pairs.md)."""
 
 import numpy as np
 import trimesh

@@ -1,4 +1,4 @@
-"""How far apart, where, and how deep: python scenes/02_how_far.py (docs/howto_distance.md)."""
+"""Distances, nearest points and depths: python scenes/02_how_far.py (docs/howto_distance.md)."""
 
 import trimesh
 

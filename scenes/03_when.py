@@ -1,4 +1,4 @@
-"""When moving objects first touch: python scenes/03_when.py (docs/howto_motion.md)."""
+"""First contacts of moving objects: python scenes/03_when.py (docs/howto_motion.md)."""
 
 import numpy as np
 import trimesh

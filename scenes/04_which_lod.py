@@ -1,4 +1,4 @@
-"""At which level of detail: python scenes/04_which_lod.py (docs/howto_lod.md)."""
+"""Levels of detail: python scenes/04_which_lod.py (docs/howto_lod.md)."""
 
 import trimesh
 

@@ -1,4 +1,4 @@
-"""What the tests share: the devices present, and where real meshes may lie."""
+"""Fixtures of all tests: the devices present, and the folder of real meshes."""
 
 import os
 from pathlib import Path

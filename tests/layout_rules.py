@@ -33,6 +33,11 @@ BANNED = """asker carriers cover_piece crossing_faces dial hungry judge_budget j
     patience peer peers rivals rub_point bounce_pair rung rungs send_home settle_hard settle_faces turned_in unsure
     within_tenth wish""".split()
 
+# A title names its file's subject; the first words of riddles do not.
+RIDDLES = re.compile(r"(How|Until|What|Whatever|When|Where|Whether|Which|Who|Whose)\b")
+# Names that every module of a kind has: options of kernels, commands of the command line.
+SHARED_NAMES = {"MODULE_OPTIONS", "EXAMPLES", "OUTPUTS", "SUMMARY", "add_arguments", "main"}
+
 PACKAGE = sorted(path for name in MAY_IMPORT for path in (ROOT / "warp_abtree" / name).rglob("*.py"))
 KERNELS = sorted((ROOT / "kernels").rglob("*.py"))
 NATIVE = sorted(path for path in (ROOT / "kernels").rglob("*") if path.suffix in (".h", ".cuh", ".cpp", ".cu"))
@@ -278,6 +283,40 @@ def banned_faults(tree):
     names |= {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
     banned = re.compile(rf"(^|_)({'|'.join(BANNED)})(_|$)")
     return sorted(name for name in names if banned.search(name.lower()))
+
+
+def title_faults(source):
+    """List the title of a module or native file that asks in the place of naming the subject, or the lack of one."""
+    if source.lstrip().startswith("//"):
+        title = source.lstrip().partition("\n")[0].lstrip("/ ")
+    else:
+        title = (ast.get_docstring(parse(source)) or "").partition("\n")[0]
+    return [f"line 1: {title}"] if not title or RIDDLES.match(title) else []
+
+
+def is_bound(node):
+    return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+
+
+def top_level_names(tree):
+    """Return the names that a module defines at its top level, but for private ones."""
+    names = set()
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names |= {part.id for target in targets for part in ast.walk(target) if is_bound(part)}
+    return {name for name in names if not name.startswith("_")}
+
+
+def twice_defined(trees):
+    """Return the names that several modules define, each with its modules; one name has one meaning."""
+    modules = {}
+    for module, tree in trees.items():
+        for name in top_level_names(tree) - SHARED_NAMES:
+            modules.setdefault(name, []).append(module)
+    return {name: found for name, found in modules.items() if len(found) > 1}
 
 
 def public_names():

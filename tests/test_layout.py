@@ -38,6 +38,8 @@ from layout_rules import (
     size_faults,
     snippet_faults,
     struct_faults,
+    title_faults,
+    twice_defined,
 )
 
 
@@ -114,6 +116,11 @@ def test_files(path):
     assert not hidden_import_faults(tree)
     assert not size_faults(tree, text)
     assert not banned_faults(tree)
+    assert not title_faults(text)
+
+
+def test_a_name_has_one_definition():
+    assert twice_defined({shown(path): parse(path) for path in (*PACKAGE, *KERNELS)}) == {}
 
 
 def test_folders_hold_few_files():
@@ -132,6 +139,7 @@ def test_native_code_stands_in_its_folder():
     assert all(path.is_relative_to(ROOT / "kernels" / "native") for path in NATIVE)
     lengths = {shown(path): len(path.read_text(encoding="utf-8").splitlines()) for path in NATIVE}
     assert {name: count for name, count in lengths.items() if count > NATIVE_LINES} == {}
+    assert [shown(path) for path in NATIVE if title_faults(path.read_text(encoding="utf-8"))] == []
 
 
 def test_kernel_folders_hold_no_code_in_init():
@@ -271,6 +279,31 @@ def test_rule_of_native_code_catches():
 def test_rule_of_names_catches(source):
     assert banned_faults(parse(source))
     assert not banned_faults(parse("rungs_of_the_sea = strung = 1".replace("rungs_of_the_sea", "sprung")))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        '"""Whether two boxes overlap."""',
+        '"""How far."""\nx = 1',
+        '"""\nWhich pairs meet."""',
+        "x = 1",
+        "// How wide.\n",
+    ],
+)
+def test_rule_of_titles_catches(source):
+    assert title_faults(source)
+    assert not title_faults('"""Whichever: even-odd ray test.\n\nWhether a point is inside."""')
+    assert not title_faults("// Slabs.\n// How wide.\n")
+
+
+@pytest.mark.parametrize(
+    "source", ["def f():\n    pass", "class f:\n    pass", "f = 1", "e, f = 1, 2", "e, (f, g) = x", "f: int = 1"]
+)
+def test_rule_of_names_of_one_meaning_catches(source):
+    fine = "from a import f\n_f = 1\nMODULE_OPTIONS = {}\ndef h():\n    f = 1"
+    assert twice_defined({"a": parse(source), "b": parse("f = 2"), "c": parse(fine)}) == {"f": ["a", "b"]}
+    assert twice_defined({"a": parse(source), "c": parse(fine), "d": parse("MODULE_OPTIONS = f.x = _f = 1")}) == {}
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What is shipped: wheel and source distribution hold the package, its kernels and scenes, and a wheel runs alone."""
+"""Packaging: wheel and source distribution hold the package, its kernels and scenes, and a wheel runs alone."""
 
 import email
 import json

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_abtree.checks.regime import Regime, change_regime, current_regime, restore_regime
 from warp_abtree.kernels.exact.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
-from warp_abtree.kernels.motion.face_pair import CLEAR, UNDECIDED, Contact
+from warp_abtree.kernels.motion.face_pair import CLEAR, UNDECIDED, FirstContact
 from warp_abtree.kernels.motion.linear import advance_corners_kernel
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, float32_filter_triangles
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
@@ -98,7 +98,7 @@ def advance_corners(starts, ends, tolerance=1e-6, device="cpu"):
     Args:
         starts, ends: Corners of A's face and of B's at first and at last, float64 (p, 6, 3).
     """
-    contacts = wp.empty(len(starts), dtype=Contact, device=device)
+    contacts = wp.empty(len(starts), dtype=FirstContact, device=device)
     given = [wp.array(corners, dtype=wp.vec3d, device=device) for corners in (starts, ends)]
     # Each coordinate on the way errs by 4 u, so do dot products: 28 u of the largest in all.
     inputs = [wp.float64(tolerance), wp.float64(2.0**-48), *given, contacts]

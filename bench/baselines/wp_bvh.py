@@ -1,4 +1,4 @@
-"""What a Warp user writes and tunes: one thread a face of A, a wp.Bvh over the faces of B, wp.intersect_tri_tri.
+"""Baseline of Warp alone, tuned: one thread a face of A, a wp.Bvh over the faces of B, wp.intersect_tri_tri.
 
 Tuned: one relative pose a pair, corners face by face, faces along a Morton curve so that neighbouring threads walk
 alike, 64 threads a block, and the constructor that answers fastest (`find_constructor`). A baseline for time only: its

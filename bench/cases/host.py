@@ -1,4 +1,4 @@
-"""What reading results adds to launches: time of `Scene.intersect` beside that of the launches, by output and size."""
+"""Time to read results: `Scene.intersect` beside its launches, by output and size."""
 
 import gc
 

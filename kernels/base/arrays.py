@@ -15,6 +15,9 @@ LEVEL_MAX = wp.constant(31)
 LAST_KEY = wp.constant(wp.int64(2**63 - 1))
 """Sorts behind all keys."""
 
+NONE_REFUSED = wp.constant(2**31 - 1)
+"""In place of the index of the first row that is refused."""
+
 
 @wp.struct
 class ModelPool:
@@ -28,8 +31,8 @@ class ModelPool:
     split_face: wp.array(dtype=wp.int32)  # faces that each vertex split inserts or deforms, slice by slice
     leaf_node: wp.array(dtype=wp.int32)  # node of each face, the indexed list of the paper, shape [face]
     node_face: wp.array(dtype=wp.int32)  # face of a leaf, -1 at an inner node, -1 without a node, shape [node]
-    node_slab: wp.array(dtype=wp.vec4)  # `slabs.overlap.Slab` of nodes of few faces, shape [node], or [0]
-    slab_gain: wp.array(dtype=wp.vec2i)  # sum of `slabs.make_slabs.gain_of`, and its terms, shape [model]
+    node_slab: wp.array(dtype=wp.vec4)  # `slab_overlap.NodeSlab` of nodes of few faces, shape [node], or [0]
+    slab_gain: wp.array(dtype=wp.vec2i)  # sum of `make_slabs.gain_of`, and its terms, shape [model]
     face_start: wp.array(dtype=wp.int32)  # where its faces begin, shape [model]
     face_count: wp.array(dtype=wp.int32)  # shape [model]
     depth: wp.array(dtype=wp.int32)  # of its tree, shape [model]

@@ -48,7 +48,7 @@ def round_up_vec(x: wp.vec3d):
 
 @wp.func_native(native.body("base/numbers.cuh", "fuse32"))
 def fuse32(a: wp.float32, b: wp.float32, c: wp.float32) -> wp.float32:
-    """Return a b + c, rounded once on every device: half the work, and never less exact where a bound is at hand."""
+    """Return a b + c, rounded once on every device (fused multiply-add): half the work, and no less exact."""
 
 
 @wp.func
@@ -90,7 +90,7 @@ def pose_box(lower: wp.vec3, upper: wp.vec3, rotation: wp.mat33, translation: wp
 
 @wp.func_native(native.body("base/numbers.cuh", "all_within"))
 def all_within(p: wp.vec3, u: wp.vec3, q: wp.vec3, v: wp.vec3) -> bool:
-    """Return whether |p| <= u and |q| <= v in every component, without the branches that `and` would be."""
+    """Return whether |p| <= u and |q| <= v in every component, without branches."""
 
 
 @wp.func

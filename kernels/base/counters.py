@@ -13,7 +13,7 @@ counters_code = functools.partial(native.body, "base/counters.cuh")
 
 @wp.func_native(counters_code("add_lanes"))
 def add_lanes(totals: wp.array(dtype=wp.int64), i: wp.int32, x: wp.int64):
-    """Add to a total what each lane of a warp brings; all lanes call it together, with the same i."""
+    """Add the values of all lanes of a warp to a total; all lanes call it together, with the same i."""
 
 
 @wp.func_native(counters_code("reserve_slot"))

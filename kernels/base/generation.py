@@ -9,7 +9,7 @@ STALE = wp.constant(-2)
 
 @wp.struct
 class LaunchRecord:
-    """The generations of arrays that a launch was given, those in force when it runs, and what became of it."""
+    """Generations of arrays: those that a launch was given, those in force when it runs, and the launch's outcome."""
 
     states: wp.int32  # of the tree states given; a captured graph keeps those of its capture
     filter: wp.int32  # of the filter given

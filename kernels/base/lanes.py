@@ -63,7 +63,7 @@ def warp_sync(): ...
 
 @wp.func_native(lanes_code("hold_uniform"))
 def hold_uniform(x: wp.int32) -> wp.int32:
-    """Return a number that is the same in all lanes, so that it is held and not computed again where it is used."""
+    """Return a number that is the same in all lanes; keeps the compiler from computing it again at each use."""
 
 
 @wp.func_native(lanes_code("warp_any"))
@@ -72,7 +72,7 @@ def warp_any(flag: bool) -> bool: ...
 
 @wp.func_native(lanes_code("add_in_order"))
 def add_in_order(sum: six_numbers, x: six_numbers, count: wp.int32) -> six_numbers:
-    """Return sums and the numbers of so many lanes, added one after the other; on the CPU, of the one thread."""
+    """Add the numbers of so many lanes to sums, one lane after the other; on the CPU, of the one thread."""
 
 
 @wp.func_native(lanes_code("warp_max"))

@@ -13,14 +13,18 @@ from warp_abtree.kernels.base.nodes import load_node
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-# Products of three coordinates stay normal above this.
+# Products of three coordinates stay normal above this; smaller ones are 0.
 COORDINATE_MIN = wp.constant(wp.float64(2.0**-290))
 ROUNDING_32 = wp.constant(wp.float64(9.0 * 2.0**-24))
 UNIT_32 = wp.constant(wp.float64(2.0**-24))
 # Between these sizes of models float32 neither overflows nor loses digits to underflow.
 REACH_MIN = wp.constant(wp.float64(2.0**-100))
 REACH_MAX = wp.constant(wp.float64(2.0**100))
+# Some ten float64 roundings; this is 32 of them.
 ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
+# Of what brings small sizes to about 1.
+SCALE_MAX = wp.constant(wp.float64(2.0**100))
+HALF = wp.constant(wp.float64(0.5))
 # Nodes so few levels above the leaves have slabs: of 8 faces at most.
 SLAB_DEPTH = wp.constant(3)
 NO_NODE = wp.constant(2**31 - 1)
@@ -94,7 +98,7 @@ def reach_box(lower: wp.vec3, upper: wp.vec3):
 
 @wp.func
 def measure_rotation(r: wp.mat33d):
-    """Return how far R^T R and R are off the identity, the largest entries."""
+    """Return the largest entries of |R^T R - 1| and |R - 1|."""
     skew = wp.float64(0.0)
     size = wp.float64(0.0)
     for i in range(3):
@@ -114,7 +118,7 @@ def unit_scale(reach: wp.float64):
 
 
 @wp.func
-def has_slabs(models: ModelPool, states: StatePool, state: wp.int32):
+def has_node_slabs(models: ModelPool, states: StatePool, state: wp.int32):
     """Return whether there are slabs of a state's nodes: of original faces, and where they gain."""
     model = states.model[state]
     if models.node_slab.shape[0] == 0 or states.lod[state] < models.lod_max[model]:
@@ -125,14 +129,14 @@ def has_slabs(models: ModelPool, states: StatePool, state: wp.int32):
 
 @wp.func
 def active_faces(models: ModelPool, states: StatePool, state: wp.int32):
-    """Return about how many faces a state has: a vertex split of a closed manifold adds two."""
+    """Estimate the number of faces of a state: a vertex split of a closed manifold adds two."""
     model = states.model[state]
     return models.face_count[model] - 2 * (models.lod_max[model] - states.lod[state])
 
 
 @wp.func
 def place_trees(models: ModelPool, states: StatePool, state_a: wp.int32, state_b: wp.int32):
-    """Return a `PairPose` that says where the trees lie, and no more."""
+    """Return a `PairPose` with the places of the trees in the pool, and no more."""
     pose = PairPose()
     pose.node_a = states.node_start[state_a]
     pose.node_b = states.node_start[state_b]
@@ -143,7 +147,7 @@ def place_trees(models: ModelPool, states: StatePool, state_a: wp.int32, state_b
     model_a, model_b = states.model[state_a], states.model[state_b]
     pose.slab = wp.vec2i(models.node_start[model_a], models.node_start[model_b])
     pose.floor = wp.vec2i(NO_NODE, NO_NODE)
-    if has_slabs(models, states, state_a) and has_slabs(models, states, state_b):
+    if has_node_slabs(models, states, state_a) and has_node_slabs(models, states, state_b):
         pose.floor[0] = 1 << wp.max(models.depth[model_a] - SLAB_DEPTH, 0)
         pose.floor[1] = 1 << wp.max(models.depth[model_b] - SLAB_DEPTH, 0)
     return pose

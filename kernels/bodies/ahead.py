@@ -1,4 +1,4 @@
-"""How far ahead of bodies contacts are looked for: as they may come in a step, but little beyond the nearest faces.
+"""Speculative contact gaps of rigid bodies: the motion of a step, but little beyond the nearest faces.
 
 Two fine surfaces that come together fast have very many pairs of faces within the motion of a step, of which the
 nearest are what they meet with. So the gap of such an object pair is cut to its distance and half the size of a face.
@@ -29,7 +29,7 @@ class Chosen:
 
 @wp.func
 def half_face_size(models: ModelPool, states: StatePool, state: wp.int32, radius: wp.float64):
-    """Return about half of how wide the faces of a body are at its LOD, as if it were a ball [world units]."""
+    """Estimate half the width of a body's faces at its LOD, as if it were a ball [world units]."""
     model = states.model[state]
     faces = models.face_count[model] - 2 * (models.lod_max[model] - states.lod[state])
     return HALF_ROOT * radius / wp.sqrt(wp.float64(wp.max(faces, FACES_LEAST)))

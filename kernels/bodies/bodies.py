@@ -6,6 +6,7 @@ A body frame has its origin at the centre of mass and its axes along the princip
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import ObjectPool
+from warp_abtree.kernels.base.poses import HALF
 from warp_abtree.kernels.intersect.face_pairs import Hits
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -15,9 +16,7 @@ KINEMATIC = wp.constant(1)
 DYNAMIC = wp.constant(2)
 """Motion type of an object: it stands, its motion is prescribed, or it is a rigid body."""
 
-HALF = wp.constant(wp.float64(0.5))
-
-REACH_LEAST, REACH_MAX = wp.constant(wp.float64(2.0**-8)), wp.constant(wp.float64(0.25))
+LOOKAHEAD_LEAST, LOOKAHEAD_MAX = wp.constant(wp.float64(2.0**-8)), wp.constant(wp.float64(0.25))
 """How far ahead of a body contacts are looked for, beside its motion in a step, and motion at most, in its radii."""
 
 
@@ -82,7 +81,7 @@ def judge_contacts_kernel(
     # out
     bodies_out: Bodies,
 ):
-    """Find whether a query has found all contacts in the room that it had; one thread."""
+    """Note whether a query found all contacts within its capacity; one thread."""
     whole = launched[0] >= 0 and wp.uint32(pair_count[0]) <= wp.uint32(pair_room)
     whole = whole and wp.uint32(hits.total[0]) <= wp.uint32(hits.face.shape[0])
     if hits.uncertain.shape[0] > 0:
@@ -124,15 +123,15 @@ def begin_step_kernel(
 
 @wp.func
 def reach_of(bodies: Bodies, i: wp.int32, dt: wp.float64):
-    """Return how an object's centre moves in a step, and how far its surface may beside that, and a little more."""
+    """Return the motion of an object's centre in a step, and a bound on its surface's motion relative to that."""
     motion = dt * bodies.velocity[i]
     if bodies.motion_type[i] != DYNAMIC:
         return wp.vec4d(motion[0], motion[1], motion[2], wp.float64(0.0))
     radius = bodies.bounding_radius[i]
-    most = REACH_MAX * radius
+    most = LOOKAHEAD_MAX * radius
     motion = motion * wp.min(most / wp.max(wp.length(motion), most), wp.float64(1.0))
     turn = dt * wp.length(bodies.inverse_inertia[i] * bodies.momentum[i]) * radius
-    return wp.vec4d(motion[0], motion[1], motion[2], wp.min(turn, most) + REACH_LEAST * radius)
+    return wp.vec4d(motion[0], motion[1], motion[2], wp.min(turn, most) + LOOKAHEAD_LEAST * radius)
 
 
 @wp.kernel

@@ -1,4 +1,4 @@
-"""Steps in which surfaces that are apart stay apart: how much of its motion each body makes.
+"""Continuous collision of rigid bodies: motions of a step cut so that surfaces that are apart stay apart.
 
 Each object has a goal, where the step would take it, and an end of its way there, at first the goal. A round searches
 the first contacts of all pairs on these ways, and cuts the ways of both objects of a pair at its time, less a little.
@@ -17,19 +17,19 @@ from warp_abtree.kernels.bodies.constraints import SLOP
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, UNDECIDED
 from warp_abtree.kernels.motion.path import Motion, make_path
-from warp_abtree.kernels.motion.start import OPEN, Contacts
+from warp_abtree.kernels.motion.start import OPEN, FirstContacts
 from warp_abtree.kernels.motion.turn import shortest_turn, turn_matrix
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-TOUCHING, UNDECIDED_PAIRS, HELD = wp.constant(0), wp.constant(1), wp.constant(2)
-"""Entries of `Ways.counter`."""
+TOUCHING, UNDECIDED_PAIRS, HELD_PAIRS = wp.constant(0), wp.constant(1), wp.constant(2)
+"""Entries of `StepMotions.counter`."""
 
-CUT, MATCH, HOLD, CERTIFY = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
+CUT, MATCH, HOLD_BOTH, CERTIFY = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
 """What a round does with pairs that are not clear: cut ways at the time of contact, cut the larger fraction to the
 smaller, cut both at the start, or hold the world."""
 
-NEAR, NEARER = wp.constant(wp.float64(0.25)), wp.constant(wp.float64(1.0 / 32.0))
+NEAR, VERY_NEAR = wp.constant(wp.float64(0.25)), wp.constant(wp.float64(1.0 / 32.0))
 FREE, STUCK, ON_TRIAL, STUCK_AGAIN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
 """Whether a body's last motion was cut to next to nothing, and what came of it; the odd ones move out of contact."""
 
@@ -39,8 +39,8 @@ ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 
 
 @wp.struct
-class Ways:
-    """Ways of objects in a step."""
+class StepMotions:
+    """Motions of objects in a step."""
 
     # static
     world: wp.array(dtype=wp.int32)  # number of the world that is held together, shape [object]
@@ -52,16 +52,16 @@ class Ways:
     cut: wp.array(dtype=wp.float64)  # fraction of its way that the round leaves, shape [object]
     is_changed: wp.array(dtype=wp.int32)  # whether the last round has cut its way, 0 or 1, shape [object]
     is_held: wp.array(dtype=wp.int32)  # of each world, 0 or 1, shape [object]
-    level: wp.array(dtype=wp.int32)  # of a pair's `margin_of`; EXEMPT where ways do not matter, shape [pair]
+    level: wp.array(dtype=wp.int32)  # of a pair's margin, 0 to LAST_LEVEL; EXEMPT where not searched, shape [pair]
     is_again: wp.array(dtype=wp.int32)  # whether a pair is searched again at another level, 0 or 1, shape [pair]
     counter: wp.array(dtype=wp.int32)  # touching and undecided pairs, and pairs that held a world, shape [3]
 
 
 @wp.kernel
-def free_stuck_kernel(dt: wp.float64, objects: ObjectPool, bodies_inout: Bodies, ways_inout: Ways):
+def free_stuck_kernel(dt: wp.float64, objects: ObjectPool, bodies_inout: Bodies, motions_inout: StepMotions):
     """Let a body that was stuck in the last step move by its position correction alone, out of contact."""
     i = wp.tid()
-    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] != DYNAMIC or (ways_inout.stuck[i] & 1) == 0:
+    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] != DYNAMIC or (motions_inout.stuck[i] & 1) == 0:
         return
     axes, centre = bodies_inout.axes[i], bodies_inout.centre[i]
     turn = rotation_by(dt * (bodies_inout.inverse_inertia[i] * bodies_inout.pseudo_momentum[i]))
@@ -70,29 +70,29 @@ def free_stuck_kernel(dt: wp.float64, objects: ObjectPool, bodies_inout: Bodies,
     bodies_inout.rotation[i] = q
     bodies_inout.position[i] = position
     rotation = wp.quat_to_matrix(q) * wp.transpose(axes)
-    ways_inout.goals.rotation[i] = rotation
-    ways_inout.goals.position[i] = position - rotation * centre
+    motions_inout.goals.rotation[i] = rotation
+    motions_inout.goals.position[i] = position - rotation * centre
 
 
 @wp.kernel
-def begin_way_kernel(objects: ObjectPool, bodies: Bodies, ways_inout: Ways):
+def begin_way_kernel(objects: ObjectPool, bodies: Bodies, motions_inout: StepMotions):
     """Let an object's way end at its goal, without its turn where that is half a revolution, which has no way."""
     i = wp.tid()
     if i == 0:
         for k in range(3):
-            ways_inout.counter[k] = 0
-    ways_inout.fraction[i] = wp.where(bodies.motion_type[i] == STATIC, ZERO, ONE)
-    ways_inout.cut[i] = ONE
-    ways_inout.is_changed[i] = 1
-    ways_inout.is_held[i] = 0
-    ways_inout.ends.rotation[i] = objects.rotation[i]
-    ways_inout.ends.position[i] = objects.position[i]
+            motions_inout.counter[k] = 0
+    motions_inout.fraction[i] = wp.where(bodies.motion_type[i] == STATIC, ZERO, ONE)
+    motions_inout.cut[i] = ONE
+    motions_inout.is_changed[i] = 1
+    motions_inout.is_held[i] = 0
+    motions_inout.ends.rotation[i] = objects.rotation[i]
+    motions_inout.ends.position[i] = objects.position[i]
     if bodies.is_whole[0] != 0 and bodies.motion_type[i] != STATIC:
-        goal = ways_inout.goals.rotation[i]
+        goal = motions_inout.goals.rotation[i]
         _axis, angle, _half = shortest_turn(wp.transpose(objects.rotation[i]) * goal)
-        ways_inout.ends.position[i] = ways_inout.goals.position[i]
+        motions_inout.ends.position[i] = motions_inout.goals.position[i]
         if angle >= ZERO:
-            ways_inout.ends.rotation[i] = goal
+            motions_inout.ends.rotation[i] = goal
 
 
 @wp.kernel
@@ -101,7 +101,7 @@ def exempt_pair_kernel(
     pairs: wp.array(dtype=wp.vec2i),
     hits: Hits,
     bodies: Bodies,
-    ways_inout: Ways,
+    motions_inout: StepMotions,
 ):
     """Exempt a pair a thread whose surfaces intersect at first, or neither of which is a rigid body."""
     p = wp.tid()
@@ -109,15 +109,15 @@ def exempt_pair_kernel(
         return
     moves = bodies.motion_type[pairs[p][0]] == DYNAMIC or bodies.motion_type[pairs[p][1]] == DYNAMIC
     touches = hits.any_hit[p] != 0
-    ways_inout.level[p] = wp.where(touches or not moves, EXEMPT, 0)
-    ways_inout.is_again[p] = 0
+    motions_inout.level[p] = wp.where(touches or not moves, EXEMPT, 0)
+    motions_inout.is_again[p] = 0
     if touches and moves:
-        wp.atomic_add(ways_inout.counter, TOUCHING, 1)
+        wp.atomic_add(motions_inout.counter, TOUCHING, 1)
 
 
 @wp.kernel
 def choose_pair_kernel(
-    pair_count: wp.array(dtype=wp.int32), pairs: wp.array(dtype=wp.vec2i), ways: Ways, hits_inout: Hits
+    pair_count: wp.array(dtype=wp.int32), pairs: wp.array(dtype=wp.vec2i), motions: StepMotions, hits_inout: Hits
 ):
     """Choose a pair a thread for the next round: the search leaves out those that are marked as intersecting."""
     p = wp.tid()
@@ -125,9 +125,10 @@ def choose_pair_kernel(
         return
     a, b = pairs[p][0], pairs[p][1]
     changed = (
-        ways.is_changed[a] + ways.is_changed[b] + ways.is_again[p] > 0 and ways.fraction[a] + ways.fraction[b] > ZERO
+        motions.is_changed[a] + motions.is_changed[b] + motions.is_again[p] > 0
+        and motions.fraction[a] + motions.fraction[b] > ZERO
     )
-    hits_inout.any_hit[p] = wp.where(changed and ways.level[p] != EXEMPT, 0, 1)
+    hits_inout.any_hit[p] = wp.where(changed and motions.level[p] != EXEMPT, 0, 1)
 
 
 @wp.func
@@ -139,16 +140,16 @@ def slop_of(bodies: Bodies, pair: wp.vec2i):
 def widen_motion_kernel(
     pair_count: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
-    contacts: Contacts,
+    contacts: FirstContacts,
     bodies: Bodies,
-    ways: Ways,
+    motions: StepMotions,
     motion_inout: wp.array(dtype=Motion),
 ):
-    """Let the surfaces of a pair a thread count as in contact when near: by a quarter of a slop, or 1/32 of that."""
+    """Thicken the surfaces of a pair a thread where they are near: by a quarter of a slop, or 1/32 of that."""
     p = wp.tid()
-    if p >= pair_count[0] or contacts.end[p] != OPEN or ways.level[p] >= LAST_LEVEL:
+    if p >= pair_count[0] or contacts.end[p] != OPEN or motions.level[p] >= LAST_LEVEL:
         return
-    margin = slop_of(bodies, pairs[p]) * wp.where(ways.level[p] == 0, NEAR, NEAR * NEARER)
+    margin = slop_of(bodies, pairs[p]) * wp.where(motions.level[p] == 0, NEAR, NEAR * VERY_NEAR)
     motion = motion_inout[p]
     motion.slack = motion.slack + margin
     motion.margin = motion.margin + wp.float32(margin * motion.scale)
@@ -156,13 +157,13 @@ def widen_motion_kernel(
 
 
 @wp.func
-def way_length(objects: ObjectPool, ways: Ways, bodies: Bodies, i: wp.int32):
-    """Return about how far a body's surface moves, 0 for others."""
+def way_length(objects: ObjectPool, motions: StepMotions, bodies: Bodies, i: wp.int32):
+    """Estimate the length of the path of a body's surface, 0 for others."""
     if bodies.motion_type[i] != DYNAMIC:
-        return wp.length(ways.ends.position[i] - objects.position[i])
-    turn = ways.ends.rotation[i] - objects.rotation[i]
+        return wp.length(motions.ends.position[i] - objects.position[i])
+    turn = motions.ends.rotation[i] - objects.rotation[i]
     side = wp.sqrt(wp.ddot(turn, turn)) * bodies.bounding_radius[i]
-    return wp.length(ways.ends.position[i] - objects.position[i]) + side
+    return wp.length(motions.ends.position[i] - objects.position[i]) + side
 
 
 @wp.kernel
@@ -172,74 +173,74 @@ def cut_way_kernel(
     pairs: wp.array(dtype=wp.vec2i),
     objects: ObjectPool,
     hits: Hits,
-    contacts: Contacts,
+    contacts: FirstContacts,
     bodies: Bodies,
-    ways_inout: Ways,
+    motions_inout: StepMotions,
 ):
     """Cut the ways of both objects of a pair a thread that is not proved clear, or hold their worlds."""
     p = wp.tid()
     if p >= pair_count[0] or hits.any_hit[p] != 0:
         return
-    ways_inout.is_again[p] = 0
+    motions_inout.is_again[p] = 0
     if contacts.end[p] == CLEAR:
         return
     a, b = pairs[p][0], pairs[p][1]
-    if mode <= MATCH and contacts.time[p] == ZERO and ways_inout.level[p] < LAST_LEVEL:
-        ways_inout.level[p] += 1
-        ways_inout.is_again[p] = 1
+    if mode <= MATCH and contacts.time[p] == ZERO and motions_inout.level[p] < LAST_LEVEL:
+        motions_inout.level[p] += 1
+        motions_inout.is_again[p] = 1
         return
     if contacts.end[p] == UNDECIDED:
-        wp.atomic_add(ways_inout.counter, UNDECIDED_PAIRS, 1)
+        wp.atomic_add(motions_inout.counter, UNDECIDED_PAIRS, 1)
     if mode == CERTIFY:
-        wp.atomic_add(ways_inout.counter, HELD, 1)
+        wp.atomic_add(motions_inout.counter, HELD_PAIRS, 1)
         for k in range(2):
             if bodies.motion_type[pairs[p][k]] != STATIC:
-                wp.atomic_max(ways_inout.is_held, ways_inout.world[pairs[p][k]], 1)
+                wp.atomic_max(motions_inout.is_held, motions_inout.world[pairs[p][k]], 1)
         return
-    if mode == HOLD:
-        wp.atomic_min(ways_inout.cut, a, ZERO)
-        wp.atomic_min(ways_inout.cut, b, ZERO)
+    if mode == HOLD_BOTH:
+        wp.atomic_min(motions_inout.cut, a, ZERO)
+        wp.atomic_min(motions_inout.cut, b, ZERO)
         return
     # A quarter of a slop before the contact, where contacts ahead find it.
-    length = way_length(objects, ways_inout, bodies, a) + way_length(objects, ways_inout, bodies, b)
+    length = way_length(objects, motions_inout, bodies, a) + way_length(objects, motions_inout, bodies, b)
     back = NEAR * slop_of(bodies, pairs[p])
     fraction = wp.max(contacts.time[p] - back / wp.max(length, back), ZERO)
-    fraction_a, fraction_b = ways_inout.fraction[a], ways_inout.fraction[b]
+    fraction_a, fraction_b = motions_inout.fraction[a], motions_inout.fraction[b]
     less, more = wp.min(fraction_a, fraction_b), wp.max(fraction_a, fraction_b)
     static = bodies.motion_type[a] == STATIC or bodies.motion_type[b] == STATIC
     if static or less == more:
-        wp.atomic_min(ways_inout.cut, a, fraction)
-        wp.atomic_min(ways_inout.cut, b, fraction)
+        wp.atomic_min(motions_inout.cut, a, fraction)
+        wp.atomic_min(motions_inout.cut, b, fraction)
         return
     shorter = less / more
     if mode == CUT:
         shorter = wp.max(shorter, fraction)
-    wp.atomic_min(ways_inout.cut, wp.where(fraction_a == more, a, b), shorter)
+    wp.atomic_min(motions_inout.cut, wp.where(fraction_a == more, a, b), shorter)
 
 
 @wp.kernel
-def apply_cut_kernel(objects: ObjectPool, bodies: Bodies, ways_inout: Ways):
+def apply_cut_kernel(objects: ObjectPool, bodies: Bodies, motions_inout: StepMotions):
     """End an object's way where the round has cut it."""
     i = wp.tid()
-    fraction = ways_inout.cut[i]
-    ways_inout.cut[i] = ONE
-    changed = fraction < ONE and ways_inout.fraction[i] > ZERO
-    ways_inout.is_changed[i] = wp.where(changed, 1, 0)
+    fraction = motions_inout.cut[i]
+    motions_inout.cut[i] = ONE
+    changed = fraction < ONE and motions_inout.fraction[i] > ZERO
+    motions_inout.is_changed[i] = wp.where(changed, 1, 0)
     if not changed:
         return
-    ways_inout.fraction[i] = fraction * ways_inout.fraction[i]
+    motions_inout.fraction[i] = fraction * motions_inout.fraction[i]
     if fraction == ZERO:
-        ways_inout.ends.rotation[i] = objects.rotation[i]
-        ways_inout.ends.position[i] = objects.position[i]
+        motions_inout.ends.rotation[i] = objects.rotation[i]
+        motions_inout.ends.position[i] = objects.position[i]
         return
-    path = make_path(False, objects, ways_inout.ends, i)
+    path = make_path(False, objects, motions_inout.ends, i)
     rotation = objects.rotation[i] * turn_matrix(path.axis, fraction * path.angle)
     if bodies.motion_type[i] == DYNAMIC:
         # By way of a quaternion, so that it stays a rotation, cut after cut.
         axes = bodies.axes[i]
         rotation = wp.quat_to_matrix(wp.normalize(wp.quat_from_matrix(rotation * axes))) * wp.transpose(axes)
-    ways_inout.ends.rotation[i] = rotation
-    ways_inout.ends.position[i] = objects.position[i] + fraction * path.travel
+    motions_inout.ends.rotation[i] = rotation
+    motions_inout.ends.position[i] = objects.position[i] + fraction * path.travel
 
 
 @wp.func
@@ -255,7 +256,7 @@ def end_way_kernel(
     launched: wp.array(dtype=wp.int32),
     pair_count: wp.array(dtype=wp.int32),
     hits: Hits,
-    ways: Ways,
+    motions: StepMotions,
     bodies_inout: Bodies,
     objects_inout: ObjectPool,
 ):
@@ -268,26 +269,26 @@ def end_way_kernel(
     i = wp.tid()
     if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] == STATIC:
         return
-    whole = launched[0] >= 0 and wp.uint32(pair_count[0]) <= wp.uint32(ways.level.shape[0])
+    whole = launched[0] >= 0 and wp.uint32(pair_count[0]) <= wp.uint32(motions.level.shape[0])
     if hits.uncertain.shape[0] > 0:
         whole = whole and wp.uint32(hits.uncertain_total[0]) <= wp.uint32(hits.uncertain.shape[0])
     if not whole:
         return
-    fraction = ways.fraction[i]
+    fraction = motions.fraction[i]
     near = NEAR * SLOP * bodies_inout.bounding_radius[i]
-    stuck = fraction < ONE and way_length(objects_inout, ways, bodies_inout, i) < near
-    if ways.is_held[ways.world[i]] != 0:
+    stuck = fraction < ONE and way_length(objects_inout, motions, bodies_inout, i) < near
+    if motions.is_held[motions.world[i]] != 0:
         fraction = ZERO
     else:
-        objects_inout.rotation[i] = ways.ends.rotation[i]
-        objects_inout.position[i] = ways.ends.position[i]
-    ways.fraction[i] = fraction
-    before_stuck = ways.stuck[i]
+        objects_inout.rotation[i] = motions.ends.rotation[i]
+        objects_inout.position[i] = motions.ends.position[i]
+    motions.fraction[i] = fraction
+    before_stuck = motions.stuck[i]
     was_stuck = (before_stuck & 1) != 0
     now = wp.where(before_stuck == STUCK, ON_TRIAL, FREE)
     if stuck:
         now = wp.where(before_stuck == FREE, STUCK, STUCK_AGAIN)
-    ways.stuck[i] = now
+    motions.stuck[i] = now
     if bodies_inout.motion_type[i] != DYNAMIC or (fraction == ONE and not was_stuck):
         return
     rotation = objects_inout.rotation[i]

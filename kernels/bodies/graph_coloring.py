@@ -18,7 +18,7 @@ INACTIVE = wp.constant(127)
 """Color of pairs that are not solved."""
 
 
-HELD = wp.constant(wp.int64(2**55))
+HELD_BID = wp.constant(wp.int64(2**55))
 """Outbids all pairs of a round."""
 
 
@@ -28,7 +28,7 @@ def make_bid(p: wp.int32, turn: wp.int32, pair: wp.vec2i, bodies: Bodies):
 
     The hash is of ranks in a world, not of object numbers, so a world has the same coloring alone and among others.
 
-    Bits: 63..56 round + 1 | 55 zero, or HELD | 54..31 hash | 30..0 pair
+    Bits: 63..56 round + 1 | 55 zero, or HELD_BID | 54..31 hash | 30..0 pair
     """
     mixed = wp.uint32(bodies.rank[pair[0]]) * wp.uint32(40503) + wp.uint32(bodies.rank[pair[1]])
     mixed = (mixed ^ (mixed >> wp.uint32(15))) * wp.uint32(739982445)
@@ -38,8 +38,8 @@ def make_bid(p: wp.int32, turn: wp.int32, pair: wp.vec2i, bodies: Bodies):
 
 @wp.func
 def held_bid(color: wp.int32, rounds: wp.int32):
-    """Return what stands for the bid of a pair that has won a body for the rounds of a color."""
-    return (wp.int64((color + 1) * rounds) << wp.int64(56)) | HELD
+    """Return the bid by which a pair holds a body that it has won, for the rounds of a color."""
+    return (wp.int64((color + 1) * rounds) << wp.int64(56)) | HELD_BID
 
 
 @wp.kernel

@@ -21,7 +21,7 @@ POSITION = wp.constant(2)
 
 @wp.struct
 class Relaxation:
-    """What one launch relaxes."""
+    """Parameters of one relaxation launch."""
 
     stage: wp.int32  # WARM_START, VELOCITY or POSITION
     backward: wp.int32  # 1 if the first round goes from the last pair to the first
@@ -35,7 +35,7 @@ class Relaxation:
 
 @wp.struct
 class Side:
-    """What of a pair's object stays while its points are relaxed."""
+    """Constants of a pair's object while its points are relaxed."""
 
     is_dynamic: wp.bool  # whether impulses move it
     inverse_mass: wp.float64  # [1 / mass]
@@ -106,7 +106,7 @@ def store_motion(
 
 
 @wp.struct
-class Contact:
+class VelocityContact:
     """A contact point while the velocities of its pair are relaxed."""
 
     normal: wp.vec3d  # from the first to the second object
@@ -121,7 +121,7 @@ class Contact:
 
 @wp.func
 def load_contact(manifolds: Manifolds, constraints: Constraints, p: wp.int32, k: wp.int32):
-    c = Contact()
+    c = VelocityContact()
     c.normal = manifolds.normal[p, k]
     c.arm_a = constraints.arm_a[p, k]
     c.arm_b = constraints.arm_b[p, k]

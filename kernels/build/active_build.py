@@ -22,7 +22,7 @@ class FaceBoxes:
 
 @wp.func
 def find_extent(boxes: FaceBoxes, order: wp.array2d(dtype=wp.int32), axis: wp.int32, begin: wp.int32, end: wp.int32):
-    """Return the extent of the box of faces begin to end of an order."""
+    """Return the extent of the bounding box of the faces from begin to end of an order."""
     lower = boxes.lower[order[axis, begin]]
     upper = boxes.upper[order[axis, begin]]
     for i in range(begin + 1, end):
@@ -41,7 +41,7 @@ def cost_of_axis(
     middle: wp.int32,
     end: wp.int32,
 ):
-    """Return what a split along an axis is to be least in."""
+    """Return the cost of a split along an axis, which is minimised."""
     if end - begin < SMALL_SEGMENT:
         return -find_extent(boxes, order, axis, begin, end)[axis]
     left = find_extent(boxes, order, axis, begin, middle)

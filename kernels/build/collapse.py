@@ -19,7 +19,7 @@ HEAP_FULL = wp.constant(2)
 # Entries of `counter`, kept between launches.
 HEAP_SIZE = wp.constant(0)
 MERGE_COUNT = wp.constant(1)
-LIVE_FACES = wp.constant(2)
+LIVE_FACE_COUNT = wp.constant(2)
 STATUS = wp.constant(3)
 
 # Stages of a heap entry, which only rise: an edge is popped at most three times.
@@ -32,7 +32,7 @@ MIN_COS = wp.constant(wp.float64(0.2))
 MAX_REACH = wp.constant(wp.float64(4.0))  # optimum at most so many edge lengths from the midpoint
 POINT_WEIGHT = wp.constant(wp.float64(1.0e-9))
 LINE_SHARE = wp.constant(wp.float64(1.0e-6))  # orders merges of faces without area by edge length
-LAST_KEY = wp.constant(wp.float64(1.0e100))
+POSTPONED_KEY = wp.constant(wp.float64(1.0e100))
 
 
 @wp.struct
@@ -55,7 +55,7 @@ class Placement:
 
 @wp.func_native(native.body("build/fetch_edges.h", "fetch_edges"))
 def fetch_edges(surface: Surface, rings: Rings, heap: Heap, size: wp.int32):
-    """Bring what the next merges will read into the caches of this core."""
+    """Prefetch what the next merges will read into the caches of this core."""
 
 
 @wp.func
@@ -257,7 +257,7 @@ def postponed_stage(surface: Surface, rings: Rings, a: int, b: int, stage: int, 
 def postponed_key(surface: Surface, rings: Rings, a: int, b: int, stage: int, q: Quadric, cost: wp.float64):
     """Return the key of a postponed edge: a soft penalty, or after all other merges, smallest component first."""
     if stage == LAST:
-        return LAST_KEY * (wp.float64(1.0) + component_extent(surface, rings, a, b))
+        return POSTPONED_KEY * (wp.float64(1.0) + component_extent(surface, rings, a, b))
     # three times the trace is the area of the original faces merged into the two nodes
     return cost + wp.length_sq(surface.pos[b] - surface.pos[a]) * wp.float64(3.0) * (q[0] + q[3] + q[5])
 
@@ -284,7 +284,7 @@ def collapse_edges_kernel(
     """
     size = counter_inout[HEAP_SIZE]
     merges = counter_inout[MERGE_COUNT]
-    live = counter_inout[LIVE_FACES]
+    live = counter_inout[LIVE_FACE_COUNT]
     end = merges + merge_budget
     status = int(RUNNING)
     while status == RUNNING and merges < end:
@@ -320,5 +320,5 @@ def collapse_edges_kernel(
                         live -= dying
     counter_inout[HEAP_SIZE] = size
     counter_inout[MERGE_COUNT] = merges
-    counter_inout[LIVE_FACES] = live
+    counter_inout[LIVE_FACE_COUNT] = live
     counter_inout[STATUS] = status

@@ -57,7 +57,7 @@ def heap_before(key_a: wp.float64, pair_a: wp.int64, key_b: wp.float64, pair_b: 
 
 @wp.func_native(native.body("build/fetch_edges.h", "fetch_entries"))
 def fetch_entries(heap: Heap, child: wp.int32):
-    """Bring the children of four entries into the caches of this core."""
+    """Prefetch the children of four entries into the caches of this core."""
 
 
 @wp.func

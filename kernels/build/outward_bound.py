@@ -7,7 +7,7 @@ distance of that middle is a lower bound, so the gap between both is known.
 
 import warp as wp
 
-from warp_abtree.kernels.build.polygon import CORNERS, Scratch, box_distance_sq, face_distance_sq, load_polygon, polygon_distance_sq, polygon_middle, split_polygon, store_polygon
+from warp_abtree.kernels.build.polygon import POLYGON_CORNERS, Scratch, box_distance_sq, face_distance_sq, load_polygon, polygon_distance_sq, polygon_middle, split_polygon, store_polygon
 from warp_abtree.kernels.build.triangle_cover import FLOOR
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -37,7 +37,7 @@ def node_distance_sq(original: Original, node: int, p: wp.vec3d):
 
 
 @wp.func
-def nearest_face(original: Original, p: wp.vec3d, guess: int):
+def nearest_original(original: Original, p: wp.vec3d, guess: int):
     """Return the original face nearest to a point, and its squared distance; `guess` is a face to start from."""
     stack = wp.zeros(shape=(TREE_ROOM,), dtype=wp.int32)
     gap = wp.zeros(shape=(TREE_ROOM,), dtype=wp.float64)
@@ -72,7 +72,7 @@ def nearest_face(original: Original, p: wp.vec3d, guess: int):
 
 @wp.func
 def bound_triangle(original: Original, scratch: Scratch, depth: wp.array(dtype=int), guess: int, found: wp.float64):
-    """Return a bound on the squared distance of every point of the current triangle from the original surface.
+    """Bound the squared distance of any point of the current triangle from the original surface.
 
     Args:
         depth: Subdivision depth of each polygon on the stack, shape [ROWS].
@@ -97,10 +97,10 @@ def bound_triangle(original: Original, scratch: Scratch, depth: wp.array(dtype=i
         enough = wp.max(slack * found, floor)
         bound = polygon_distance_sq(original.face_pos, scratch, count, guess, enough)
         if bound > enough:
-            guess, reached = nearest_face(original, polygon_middle(scratch, count), guess)
+            guess, reached = nearest_original(original, polygon_middle(scratch, count), guess)
             found = wp.max(found, reached)
             enough = wp.max(slack * found, floor)
-            if level >= DEPTH or count + 4 > CORNERS:
+            if level >= DEPTH or count + 4 > POLYGON_CORNERS:
                 enough = wp.float64(wp.inf)
             bound = polygon_distance_sq(original.face_pos, scratch, count, guess, enough)
             if bound > enough:
@@ -124,7 +124,7 @@ def measure_points_kernel(
 ):
     """Measure squared distances of points to the original surface, each from a face that may be near."""
     i = wp.tid()
-    _, distance = nearest_face(original, point[i], guess[i])
+    _, distance = nearest_original(original, point[i], guess[i])
     distance_sq_out[i] = distance
 
 

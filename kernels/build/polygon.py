@@ -9,7 +9,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 STACK = wp.constant(64)  # polygons on the stack
-CORNERS = wp.constant(16)  # of a polygon
+POLYGON_CORNERS = wp.constant(16)  # of a polygon
 
 
 @wp.struct
@@ -18,10 +18,10 @@ class Scratch:
 
     near: wp.array(dtype=int)  # [face_count], faces to cover with; those of the merge before those of the triangle
     used: wp.array(dtype=int)  # [SLOTS], faces that cover a polygon
-    stack: wp.array2d(dtype=wp.vec3d)  # [STACK, CORNERS], polygons still to be covered
+    stack: wp.array2d(dtype=wp.vec3d)  # [STACK, POLYGON_CORNERS], polygons still to be covered
     stack_count: wp.array(dtype=int)  # [STACK], corners of each
-    polygon: wp.array(dtype=wp.vec3d)  # [CORNERS], current polygon
-    clipped: wp.array(dtype=wp.vec3d)  # [CORNERS], part of it that a cut keeps
+    polygon: wp.array(dtype=wp.vec3d)  # [POLYGON_CORNERS], current polygon
+    clipped: wp.array(dtype=wp.vec3d)  # [POLYGON_CORNERS], part of it that a cut keeps
 
 
 @wp.func

@@ -7,7 +7,7 @@ upper bound. A partition along the prisms over the faces gives zero where the su
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.build.polygon import CORNERS, STACK, Scratch, box_distance_sq, face_distance_sq, load_polygon, polygon_distance_sq, polygon_middle, split_polygon, store_polygon
+from warp_abtree.kernels.build.polygon import POLYGON_CORNERS, STACK, Scratch, box_distance_sq, face_distance_sq, load_polygon, polygon_distance_sq, polygon_middle, split_polygon, store_polygon
 from warp_abtree.kernels.build.vertex_forest import Rings
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -27,11 +27,11 @@ SLOT_FIELDS = wp.constant(native.constant("SLOT_FIELDS"))
 
 # Coordinates are within 1/2 and rounded at 2^-53: smaller bounds in flat regions are noise, not worth a cut.
 FLOOR = wp.constant(wp.float64(2.0**-46))
-MARGIN = wp.constant(wp.float64(0.05))  # of the bound: how far a polygon may extend beyond the edge of a prism
+COVER_MARGIN = wp.constant(wp.float64(0.05))  # of the bound: how far a polygon may extend beyond the edge of a prism
 # A face is skipped if its box is farther away than another face by more than rounding.
 BOX_SLACK = wp.constant(wp.float64(1.001))
 BOX_MIN = wp.constant(wp.float64(2.0**-70))
-SLACK_SQ = wp.constant(wp.float64(1.1))  # of the lower bound: a polygon within this factor is not cut
+COVER_SLACK_SQ = wp.constant(wp.float64(1.1))  # of the lower bound: a polygon within this factor is not cut
 
 
 @wp.struct
@@ -94,12 +94,12 @@ def cover_ring(
 
 @wp.func_native(native.body("build/fetch_merge.h", "fetch_merge"))
 def fetch_merge(replay: Replay, merge_pair: wp.array2d(dtype=int), merge_count: wp.int32, j: wp.int32):
-    """Bring what the merges after merge j will read into the caches of this core."""
+    """Prefetch what the merges after merge j will read into the caches of this core."""
 
 
 @wp.func
 def place_face(replay: Replay, f: int):
-    """Take an active face's corners from the forest: of candidates of one face at a time alone."""
+    """Load an active face's corners from the forest, for candidates of one face at a time."""
     a = replay.pos[replay.rings.corner_node[3 * f]]
     b = replay.pos[replay.rings.corner_node[3 * f + 1]]
     c = replay.pos[replay.rings.corner_node[3 * f + 2]]
@@ -125,7 +125,7 @@ def cover_distance_sq(replay: Replay, count: int, f: int, enough: wp.float64):
 
 
 @wp.func
-def nearest_face(replay: Replay, count: int, near_count: int, limit: wp.float64):
+def nearest_candidate(replay: Replay, count: int, near_count: int, limit: wp.float64):
     """Return the candidate with the least bound for the current polygon, or the first within `limit`, and its bound.
 
     -1 and infinity if there is no candidate.
@@ -257,15 +257,15 @@ def cover_triangle(replay: Replay, near_count: int, shared: int, own: int, room:
     while top > 0:
         top -= 1
         count = load_polygon(replay.scratch, top)
-        best, bound = nearest_face(replay, count, near_count, limit)
+        best, bound = nearest_candidate(replay, count, near_count, limit)
         final = bound <= limit
         if not final:
             before = near_count
             least, near_count = approach_polygon(replay, count, near_count, shared, own, limit)
             if near_count > before:
-                best, bound = nearest_face(replay, count, near_count, limit)
-            final = bound <= wp.max(SLACK_SQ * least, limit) or cuts >= CUTS
-            final = final or top + 4 >= STACK or count + 4 > CORNERS
+                best, bound = nearest_candidate(replay, count, near_count, limit)
+            final = bound <= wp.max(COVER_SLACK_SQ * least, limit) or cuts >= CUTS
+            final = final or top + 4 >= STACK or count + 4 > POLYGON_CORNERS
         if final:
             used = use_face(replay, count, used, room, best)
             if replay.scratch.used[used - 1] != best:
@@ -274,5 +274,5 @@ def cover_triangle(replay: Replay, near_count: int, shared: int, own: int, room:
         else:
             cuts += 1
             over = point_nearest_face(replay, near_count, polygon_middle(replay.scratch, count))
-            top = split_polygon(replay.face_pos, replay.scratch, count, top, over, FLOOR + MARGIN * wp.sqrt(limit))
+            top = split_polygon(replay.face_pos, replay.scratch, count, top, over, FLOOR + COVER_MARGIN * wp.sqrt(limit))
     return limit, used

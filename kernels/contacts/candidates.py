@@ -28,7 +28,7 @@ def group_sync(): ...
 
 @wp.func_native(group_code("must_measure"))
 def must_measure(chosen: wp.int32) -> bool:
-    """Return whether all candidates look at the points chosen, so many: always on a GPU, whose lanes go in step."""
+    """Return whether all candidates are measured against the points chosen: always on a GPU, without divergence."""
 
 
 @wp.func_native(group_code("greatest_of_group"))

@@ -78,7 +78,7 @@ def have_crossed(contacts: Contacts, i: wp.int32):
 
 @wp.func
 def blend_normals(normal_a: wp.vec3d, normal_b: wp.vec3d):
-    """Return the direction from A to B that the normals of two faces tell, 0 where neither has an area."""
+    """Return the mean direction from A to B of the normals of two faces, 0 where neither has an area."""
     normal = normal_a - normal_b
     if wp.dot(normal, normal) <= SHORTEST_NORMAL * SHORTEST_NORMAL:
         normal = normal_a

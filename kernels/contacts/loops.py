@@ -1,4 +1,4 @@
-"""Contact loops of an object pair, and their normals.
+"""Contact loops of an object pair, joined by union-find, and their normals.
 
 A loop is a set of contacts that faces link: two contacts of a pair that share a face of either object are of one loop,
 unless the other faces are of two walls that face each other, as of a slot that the face spans. Faces that are apart,
@@ -21,7 +21,7 @@ LEAST_LOOP_AREA = wp.constant(wp.float64(2.0**-20))
 
 @wp.func
 def find_root(parent: wp.array(dtype=wp.int32), i: wp.int32):
-    """Return the root of a set, and halve the way to it: threads that link neighbours at once make long ways."""
+    """Return the root of a union-find set, with path halving: concurrent unions make long paths."""
     root = i
     up = parent[root]
     while up != root:
@@ -36,7 +36,7 @@ def find_root(parent: wp.array(dtype=wp.int32), i: wp.int32):
 
 @wp.func
 def unite_roots(parent: wp.array(dtype=wp.int32), i: wp.int32, j: wp.int32):
-    """Unite two sets; the root of a set is its least member, whatever the order of unions."""
+    """Union of two sets; the root of a set is its least member, whatever the order of unions."""
     a = find_root(parent, i)
     b = find_root(parent, j)
     while a != b:
@@ -54,7 +54,7 @@ def unite_roots(parent: wp.array(dtype=wp.int32), i: wp.int32, j: wp.int32):
 
 @wp.func
 def are_across(contacts: Contacts, normal: wp.array(dtype=wp.vec3d), i: wp.int32, j: wp.int32):
-    """Return whether two contacts of a face are of two walls that face each other, which push it either way.
+    """Return whether two contacts of a face belong to opposite walls, which push it in opposite directions.
 
     Args:
         normal: Outward normals of the walls, `Contacts.normal_a` or `normal_b`.
@@ -66,7 +66,7 @@ def are_across(contacts: Contacts, normal: wp.array(dtype=wp.vec3d), i: wp.int32
 
 
 @wp.func
-def pair_key(pair: wp.int32, face: wp.int32):
+def contact_key(pair: wp.int32, face: wp.int32):
     """Return the key that sorts contacts by their pairs, and those by faces of B."""
     return (wp.int64(pair) << wp.int64(31)) | wp.int64(face)
 
@@ -90,7 +90,7 @@ def begin_loop_kernel(
     key_out[i] = LAST_KEY
     if i < start[start.shape[0] - 1]:
         curves_out.parent[i] = i
-        key_out[i] = pair_key(faces[i][0], faces[i][2])
+        key_out[i] = contact_key(faces[i][0], faces[i][2])
 
 
 @wp.kernel

@@ -19,7 +19,7 @@ FACING = wp.constant(wp.float64(0.1))
 LIKENESS = wp.constant(wp.float64(0.5))
 # By which part of a face's size its column is wider, so that walls that stand on its rim are inside.
 COLUMN_SLACK = wp.constant(wp.float64(2.0**-36))
-CORNERS = wp.constant(8)
+CLIPPED_CORNERS = wp.constant(8)
 # Depths of candidates that there are not: the middle of the contact serves where all are so, or not even that.
 NO_DEPTH, NO_POINT = wp.constant(wp.float64(-wp.inf)), wp.constant(wp.float64(wp.nan))
 
@@ -46,7 +46,7 @@ class Rows:
     start: wp.array(dtype=wp.int32)  # where those of each pair start, shape [pair + 1]
     faces: wp.array(dtype=wp.vec3i)  # pair and faces, in the order of the first object's faces, shape [contact]
     order: wp.array(dtype=wp.int32)  # contacts by their keys, shape [contact]
-    key: wp.array(dtype=wp.int64)  # `pair_key` of each in that order, or its loop, shape [contact]
+    key: wp.array(dtype=wp.int64)  # `contact_key` of each in that order, or its loop, shape [contact]
 
 
 @wp.struct
@@ -65,7 +65,7 @@ def clip_column(
 ):
     """Clip the triangle at cut to the column of the triangle at face along n; return the number of polygon corners."""
     zero = wp.float64(0.0)
-    clipped = wp.zeros(shape=(CORNERS,), dtype=wp.vec3d)
+    clipped = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.vec3d)
     count = wp.int32(3)
     for k in range(3):
         polygon[k] = corner[cut + k]
@@ -108,7 +108,7 @@ def measure_column(
     first: wp.int32,
     least: wp.float64,
 ):
-    """Return how deep one face lies behind the other along n, where, and a second such point far from it, or NO_DEPTH.
+    """Return the depth of one face behind the other along n, its point, and a second such point far away, or NO_DEPTH.
 
     Args:
         least: Depth from which on there are points: 0, or minus the gap.
@@ -129,7 +129,7 @@ def measure_column(
     origin = wp.vec3d()
     if facing < FACING:
         return none, origin, none, origin
-    polygon = wp.zeros(shape=(CORNERS,), dtype=wp.vec3d)
+    polygon = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.vec3d)
     count = clip_column(corner, face, cut, n, polygon)
     deepest = none
     point = origin

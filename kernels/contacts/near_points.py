@@ -1,4 +1,4 @@
-"""Candidate points of faces that are apart: where their own normals say how far, or where two surfaces are nearest.
+"""Candidate points of faces that are apart: gaps along face normals that face each other, else nearest points.
 
 Speculative points must not stop what merely slides past: two faces of a floor meet ahead of a box, and the edge between
 them is nearer to the side of the box than anything else of the second face. And a face behind another one may be
@@ -12,7 +12,7 @@ from warp_abtree.kernels.base.counters import reserve_slot
 from warp_abtree.kernels.base.lanes import rank_flag, warp_any, warp_size
 from warp_abtree.kernels.base.poses import PairPose, pose_point
 from warp_abtree.kernels.contacts.contact import Contacts, Deferred, have_crossed
-from warp_abtree.kernels.contacts.loops import pair_key
+from warp_abtree.kernels.contacts.loops import contact_key
 from warp_abtree.kernels.contacts.manifold import NO_DEPTH, NO_POINT, Curves, Rows, measure_column, write_candidates
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_corners
 from warp_abtree.kernels.triangle.segment import nearest_on_triangle
@@ -20,7 +20,7 @@ from warp_abtree.kernels.triangle.segment import nearest_on_triangle
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # A face's normal serves where the other face looks against it within 60 degrees.
-FACING = wp.constant(wp.float64(0.5))
+OPPOSED_LEAST = wp.constant(wp.float64(0.5))
 # Part of the distance that the gap along a face's normal differs by, where that is the direction of the distance.
 ALIKE = wp.constant(wp.float64(2.0**-10))
 # Cosine between a face's normal and the direction of the distance under which the gap differs by more than `ALIKE`.
@@ -28,7 +28,7 @@ ALONG = wp.constant(wp.float64(0.998))
 # Part of a squared distance under which another face is nearer.
 NEARER = wp.constant(wp.float64(0.998))
 # In place of the loop of a contact whose candidates count only if no other face is nearer.
-UNDECIDED = wp.constant(wp.int32(-1))
+NEAREST_ONLY = wp.constant(wp.int32(-1))
 CONTACTS_A_WARP = wp.constant(wp.int32(256))
 
 
@@ -81,14 +81,14 @@ def next_neighbour(i: wp.int32, turn: wp.int32, before: wp.int32, rows: Rows, co
         other = wp.int32(-1)
         j += wp.where(turn == 0, -1, 1)
         if turn == 2:
-            if j < rows.start[p + 1] and rows.key[j] == pair_key(p, own[2]):
+            if j < rows.start[p + 1] and rows.key[j] == contact_key(p, own[2]):
                 other = rows.order[j]
         elif j >= rows.start[p] and j < rows.start[p + 1] and rows.faces[j][1] == own[1]:
             other = j
         if other < 0:
             j = i
             if turn == 1:
-                j = wp.lower_bound(rows.key, rows.start[p], rows.start[p + 1], pair_key(p, own[2])) - 1
+                j = wp.lower_bound(rows.key, rows.start[p], rows.start[p + 1], contact_key(p, own[2])) - 1
             turn += 1
         elif contacts.separation[other] < contacts.separation[i]:
             return wp.vec3i(turn, j, other)
@@ -96,11 +96,11 @@ def next_neighbour(i: wp.int32, turn: wp.int32, before: wp.int32, rows: Rows, co
 
 
 @wp.func
-def is_undecided(contacts: Contacts, curves: Curves, i: wp.int32, end: wp.int32):
+def is_nearest_only(contacts: Contacts, curves: Curves, i: wp.int32, end: wp.int32):
     """Return whether contact i has candidates that count only where its faces are nearest."""
     if i >= end:
         return False
-    return not have_crossed(contacts, i) and curves.loop[i] == UNDECIDED
+    return not have_crossed(contacts, i) and curves.loop[i] == NEAREST_ONLY
 
 
 @wp.kernel
@@ -114,7 +114,7 @@ def keep_nearest_kernel(
     contacts: Contacts,
     curves_inout: Curves,
 ):
-    """Take candidates from contacts that have a neighbour with a face nearer to their points than theirs are.
+    """Drop the candidates of contacts of which a neighbour has a face nearer to their points than theirs are.
 
     A warp has `CONTACTS_A_WARP` contacts. A lane takes the next of them when it is done with one, so that none waits
     for the lane whose faces have most neighbours.
@@ -125,7 +125,7 @@ def keep_nearest_kernel(
     row = NearRow()
     while queue < end or warp_any(i >= 0):
         rank = rank_flag(i < 0)
-        if i < 0 and is_undecided(contacts, curves_inout, queue + (rank & 0xFFFF), end):
+        if i < 0 and is_nearest_only(contacts, curves_inout, queue + (rank & 0xFFFF), end):
             i = queue + (rank & 0xFFFF)
             turn, j, p = wp.int32(0), i, rows.faces[i][0]
             a = wp.min(pairs[p][0], pairs[p][1])
@@ -158,7 +158,7 @@ def write_near_candidates(
     contacts: Contacts,
     curves: Curves,
 ):
-    """Write the candidates of a contact along n, whose first is `depths[0]` deep; its nearest points if that is no way.
+    """Write a contact's candidates along n, the first `depths[0]` deep; its nearest points if n does not separate.
 
     Args:
         a: Object in whose frame n and the points are.
@@ -175,7 +175,7 @@ def write_near_candidates(
         ahead_a, ahead_b = wp.dot(n, back * contacts.normal_a[i]), wp.dot(n, back * contacts.normal_b[i])
         nearest = ahead_a > wp.float64(0.0) and ahead_b < wp.float64(0.0)
     if nearest and (depths[0] > wp.float64(0.0) or depths[1] != depths[1]):
-        loop = UNDECIDED
+        loop = NEAREST_ONLY
     if not nearest:
         depths = wp.vec2d(NO_POINT, NO_POINT)
     curves.loop[i] = loop
@@ -206,7 +206,7 @@ def find_near_candidate_kernel(
     if apart:
         n, normal_a, normal_b = contacts.normal[i], contacts.normal_a[i], contacts.normal_b[i]
         along = wp.max(wp.abs(wp.dot(n, normal_a)), wp.abs(wp.dot(n, normal_b)))
-        listed = -wp.dot(normal_a, normal_b) >= FACING and along >= ALONG
+        listed = -wp.dot(normal_a, normal_b) >= OPPOSED_LEAST and along >= ALONG
         if not listed:
             p = rows.faces[i][0]
             a, zero = wp.min(pairs[p][0], pairs[p][1]), wp.vec3d()

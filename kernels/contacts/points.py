@@ -1,4 +1,4 @@
-"""The few points that stand for an object pair, chosen of the candidates of its contacts."""
+"""Contact reduction: a few points of an object pair, the farthest from one another of its candidates."""
 
 import functools
 
@@ -57,7 +57,7 @@ def nearest_squared(r: wp.vec3d, s: wp.vec3d, u: wp.vec3d, v: wp.vec3d, length: 
 
 @wp.func
 def distances_squared(i: wp.int32, size: wp.float64, end: wp.int32, chosen: wp.array(dtype=wp.int32), curves: Curves):
-    """Return how far both candidates of a contact lie from the nearest segment that ends at a chosen point, squared.
+    """Return the squared distances of a contact's candidates from the nearest segment that ends at a chosen point.
 
     Args:
         size: What normals are counted in.
@@ -124,7 +124,7 @@ def measure_contact(i: wp.int32, choice: Choice, chosen: wp.array(dtype=wp.int32
 
 @wp.func
 def find_farthest(ends: wp.vec2i, choice: Choice, chosen: wp.array(dtype=wp.int32), curves: Curves):
-    """Return the candidate of a least depth that is farthest from the points chosen, and how far, squared.
+    """Return the candidate of a least depth that is farthest from the points chosen, and its squared distance.
 
     Those on one side are favoured a little, so that noise does not choose between two that are as far. From the second
     point on a candidate keeps its distance from those seen before, which bounds that from all: on a CPU only candidates
@@ -157,7 +157,7 @@ def find_farthest(ends: wp.vec2i, choice: Choice, chosen: wp.array(dtype=wp.int3
 
 @wp.func
 def find_next(ends: wp.vec2i, before: Choice, chosen: wp.array(dtype=wp.int32), curves: Curves):
-    """Return the next candidate, how far it is, squared, and the choice after it.
+    """Return the next candidate, its squared distance, and the choice after it.
 
     Those that touch, or nearly so for their spread, come before what is farther apart within the gap.
     """
@@ -217,7 +217,7 @@ def write_in_order(p: wp.int32, choice: Choice, chosen: wp.array(dtype=wp.int32)
 
 @wp.func
 def begin_choice(deepest: wp.float64, shell: wp.float64, along: wp.vec3d):
-    """Return how the points of a pair are chosen whose deepest candidate and gap are known."""
+    """Begin the choice of the points of a pair whose deepest candidate and gap are known."""
     choice = Choice()
     choice.lowest = wp.where(deepest == NO_DEPTH, NO_DEPTH, -shell)
     choice.floor = choice.lowest

@@ -1,4 +1,4 @@
-"""How far apart two faces are, or how deep they are in one another: one number, and where.
+"""Separation of two faces: their distance, or by separating axes how deep they are in one another.
 
 The separation of two triangles is the widest gap that a direction leaves between them, the greatest of
 min n.b - max n.a over unit vectors n. Where they do not intersect it is their distance; where they do, it is minus the
@@ -81,7 +81,7 @@ def offer_face(best: wp.vec2d, n: wp.vec3d, x: wp.vec3d, y: wp.vec3d, z: wp.vec3
 
 
 @wp.func
-def offer_edges(best: wp.vec2d, n: wp.vec3d, a: wp.float64, b: wp.float64, r: wp.vec3d):
+def offer_edge_gap(best: wp.vec2d, n: wp.vec3d, a: wp.float64, b: wp.float64, r: wp.vec3d):
     """Offer the gap along a vector n across an edge of each face.
 
     Args:
@@ -112,15 +112,15 @@ def crossing_depth(t: Triangles):
     # Along e x f, of an edge e of A, the corner opposite of e lies by -f . normal_a; that of f by e . normal_b.
     a0, a1, a2 = -wp.dot(f0, normal_a), -wp.dot(f1, normal_a), -wp.dot(f2, normal_a)
     b0, b1, b2 = wp.dot(e0, normal_b), wp.dot(e1, normal_b), wp.dot(e2, normal_b)
-    best = offer_edges(best, wp.cross(e0, f0), a0, b0, t.b0)
-    best = offer_edges(best, wp.cross(e0, f1), a1, b0, t.b1)
-    best = offer_edges(best, wp.cross(e0, f2), a2, b0, t.b2)
-    best = offer_edges(best, wp.cross(e1, f0), a0, b1, t.b0 - t.a1)
-    best = offer_edges(best, wp.cross(e1, f1), a1, b1, t.b1 - t.a1)
-    best = offer_edges(best, wp.cross(e1, f2), a2, b1, t.b2 - t.a1)
-    best = offer_edges(best, wp.cross(e2, f0), a0, b2, t.b0 - t.a2)
-    best = offer_edges(best, wp.cross(e2, f1), a1, b2, t.b1 - t.a2)
-    best = offer_edges(best, wp.cross(e2, f2), a2, b2, t.b2 - t.a2)
+    best = offer_edge_gap(best, wp.cross(e0, f0), a0, b0, t.b0)
+    best = offer_edge_gap(best, wp.cross(e0, f1), a1, b0, t.b1)
+    best = offer_edge_gap(best, wp.cross(e0, f2), a2, b0, t.b2)
+    best = offer_edge_gap(best, wp.cross(e1, f0), a0, b1, t.b0 - t.a1)
+    best = offer_edge_gap(best, wp.cross(e1, f1), a1, b1, t.b1 - t.a1)
+    best = offer_edge_gap(best, wp.cross(e1, f2), a2, b1, t.b2 - t.a1)
+    best = offer_edge_gap(best, wp.cross(e2, f0), a0, b2, t.b0 - t.a2)
+    best = offer_edge_gap(best, wp.cross(e2, f1), a1, b2, t.b1 - t.a2)
+    best = offer_edge_gap(best, wp.cross(e2, f2), a2, b2, t.b2 - t.a2)
     # Along one line there is no such direction, and any across it parts them.
     return wp.sqrt(wp.max(divide(-best[0], best[1]), wp.float64(0.0)))
 
@@ -150,7 +150,7 @@ def mark_near_kernel(
 
 
 @wp.kernel(cuda_max_registers=128)
-def find_depth_kernel(
+def find_separation_kernel(
     models: ModelPool,
     states: StatePool,
     pair_poses: wp.array(dtype=PairPose),
@@ -220,7 +220,7 @@ def find_near_contact_kernel(
     uncertain_only: bool,
     contacts_inout: Contacts,
 ):
-    """Compute the contacts of faces that are apart, which are listed, every so many-th a thread.
+    """Compute the contacts of faces that are apart, which are listed, in a grid-stride loop.
 
     Args:
         uncertain_only: Whether `simd_contacts` has done all but those that are uncertain there, which keep their mark.

@@ -26,7 +26,7 @@ def simd_contacts(
     place: wp.array(dtype=wp.int32),
     contacts: Contacts,
 ) -> wp.int32:
-    """Compute the contacts of an object pair's face pairs, as `find_contact`, and list those that it is not sure of.
+    """Compute the contacts of an object pair's face pairs, as `find_contact_kernel`; list those that are uncertain.
 
     Args:
         rotation, position: Pose of object A.
@@ -49,7 +49,7 @@ def simd_sum_means(contacts: Contacts, ends: wp.vec2i, total: wp.float64, number
 
 @wp.func_native(native.body("contacts/contact_sums.h", "simd_sum_areas"))
 def simd_sum_areas(contacts: Contacts, ends: wp.vec2i, middle: wp.vec3d, normal: wp.vec3d) -> six_numbers:
-    """Return the area within a pair's contact curve and its change, as `sum_loop`."""
+    """Return the area within a pair's contact curve and its change, as `sum_chunks`."""
 
 
 @wp.kernel

@@ -36,7 +36,7 @@ class PairContacts:
 
 @wp.struct
 class ChunkSums:
-    """Sums over each chunk, and what a pair's chunks need of each other."""
+    """Sums over each chunk, and data of a pair that its chunks share."""
 
     span: wp.array(dtype=wp.vec3i)  # (pair, first contact, end), shape [chunk]; nothing behind the last pair's
     length: wp.array(dtype=wp.float64)  # sum of lengths, shape [chunk]
@@ -166,7 +166,7 @@ def sum_loop_kernel(
     sums_inout: ChunkSums,
     pair_contacts_out: PairContacts,
 ):
-    """Sum what the travel needs of one chunk a warp: area within the contact curve, its change, extents of faces.
+    """Sum the terms of the travel of one chunk a warp: area within the contact curve, its change, extents of faces.
 
     Extents serve pairs without an area, which as a rule have none in any chunk: others are left out.
     """
@@ -209,9 +209,8 @@ def sum_loop_kernel(
 
 
 @wp.func
-def sum_loop(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
-    """Return area and change of all chunks of a pair, how far its faces reach along the normal, and whether that is
-    known of all chunks."""
+def sum_chunks(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
+    """Sum a pair's chunks: area, its change, extents of faces along the normal, and whether all have these."""
     all = six_numbers()
     front = -wp.float64(wp.inf)
     back = -wp.float64(wp.inf)
@@ -248,7 +247,7 @@ def measure_travel_kernel(
     sums: ChunkSums,
     pair_contacts_inout: PairContacts,
 ):
-    """Estimate the travel of one object pair a warp, and pose its mean point; docstring of warp_abtree/contact.py."""
+    """Estimate the travel of one object pair a warp, and pose its mean point; see `warp_abtree.query.contacts`."""
     p = wp.tid() / warp_size()
     _, number = sum_lengths(p, start, sums)
     if number == wp.float64(0.0):
@@ -257,7 +256,7 @@ def measure_travel_kernel(
         return
     origin = contacts.p0[start[p]]
     n = pair_contacts_inout.normal[p]
-    area, change, front, back, measured = sum_loop(p, start, sums)
+    area, change, front, back, measured = sum_chunks(p, start, sums)
     if area == wp.float64(0.0) and not measured:
         own = contact_objects(pairs, pair_poses, p)
         span = wp.vec3i(p, start[p], start[p + 1])

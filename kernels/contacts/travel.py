@@ -1,4 +1,4 @@
-"""How far an object would have to move along the mean normal of its contacts to come free, as an estimate."""
+"""Travel, an estimate: the motion along the mean normal of its contacts that frees an object."""
 
 import warp as wp
 
@@ -16,7 +16,7 @@ LEAST_SINE_SQUARED = wp.constant(wp.float64(2.0**-40))
 
 @wp.func
 def box_support(models: ModelPool, states: StatePool, objects: ObjectPool, i: wp.int32, n: wp.vec3d, origin: wp.vec3d):
-    """Return how far the root box of a posed object reaches along n from a point, world frame."""
+    """Return the support of a posed object's root box along n from a point, world frame."""
     state = objects.state[i]
     root = load_node(states, states.node_start[state] + 1)
     lower = wp.vec3d(root.lower)
@@ -31,7 +31,7 @@ def box_support(models: ModelPool, states: StatePool, objects: ObjectPool, i: wp
 
 @wp.func
 def loop_change(segment: wp.vec3d, normal_a: wp.vec3d, normal_b: wp.vec3d, n: wp.vec3d):
-    """Return how fast the area within a contact curve changes, a segment's part, as B moves along n at unit speed.
+    """Return a segment's part of the rate of change of the area within a contact curve, as B moves along n.
 
     The line of the two planes moves at v = x normal_a + y normal_b with v . normal_a = 0, v . normal_b = n . normal_b.
     """
@@ -54,7 +54,7 @@ def reach_faces(
     n: wp.vec3d,
     origin: wp.vec3d,
 ):
-    """Return how far the first object's face reaches along n from a point, and the second's against it."""
+    """Return the supports of the first object's face along n from a point, and of the second's against it."""
     a = states.face_corner[pose.corner_a + face[1 + own.swapped]]
     b = states.face_corner[pose.corner_b + face[2 - own.swapped]]
     front = -wp.float64(wp.inf)

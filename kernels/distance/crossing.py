@@ -1,4 +1,4 @@
-"""A pair of faces that intersect, of object pairs that do: the first of the trees, children in order, a point of both.
+"""First crossing faces of object pairs that intersect, by depth-first search, and a point of both.
 
 Which pair is first does not depend on how many a warp looks at together, nor on the bounds of boxes: nodes and faces
 lie on one stack in their order, a hit drops what comes after it, and the search goes on with what comes before.
@@ -11,7 +11,7 @@ from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.lanes import warp_lane, warp_min_item, warp_size, warp_sync
 from warp_abtree.kernels.base.poses import PairPose, pose_point
-from warp_abtree.kernels.distance.frame import NO_FACES, Found, Frame
+from warp_abtree.kernels.distance.frame import NO_FACES, NearestFound, SearchScale
 from warp_abtree.kernels.distance.node_pair import bound_children
 from warp_abtree.kernels.distance.report import Distances, write_nearest
 from warp_abtree.kernels.exact.predicates import EXACT
@@ -30,11 +30,11 @@ wp.set_module_options(MODULE_OPTIONS)
 
 @wp.func_native(native.body("search/nearest_stack.cuh", "push_in_order"))
 def push_in_order(items: wp.uint64, end: wp.int32, kinds: wp.vec4i, children: four_items) -> wp.int32:
-    """Append what is not dropped to the stack, the first child of the first lane last; return the new end."""
+    """Push the items that are not dropped, the first child of the first lane last; return the new end."""
 
 
 @wp.func
-def search_crossing(models: ModelPool, states: StatePool, pose: PairPose, frame: Frame, room: wp.int32):
+def search_crossing(models: ModelPool, states: StatePool, pose: PairPose, scaling: SearchScale, room: wp.int32):
     """Return the first faces of an object pair that intersect, NO_FACES where none do."""
     items = nearest_stack()
     if warp_lane() == 0:
@@ -63,7 +63,7 @@ def search_crossing(models: ModelPool, states: StatePool, pose: PairPose, frame:
         if kind != NODES:
             item = first_item(states, pose)
         children, kinds, _bounds, _tests = bound_children(
-            False, states, Slabs(), pose, frame, wp.float32(0.0), item, live
+            False, states, Slabs(), pose, scaling, wp.float32(0.0), item, live
         )
         end = push_in_order(items, end, kinds, children)
         warp_sync()
@@ -78,7 +78,7 @@ def search_crossing_kernel(
     pair_count: wp.array(dtype=wp.int32),
     pair_poses: wp.array(dtype=PairPose),
     hits: Hits,
-    found_inout: Found,
+    found_inout: NearestFound,
 ):
     """Find the first crossing faces of the object pairs that intersect, a warp a pair."""
     p = wp.tid() / warp_size()
@@ -86,7 +86,7 @@ def search_crossing_kernel(
         return
     if hits.any_hit[p] != 1:
         return
-    faces = search_crossing(models, states, pair_poses[p], found_inout.frame[p], room)
+    faces = search_crossing(models, states, pair_poses[p], found_inout.scaling[p], room)
     if warp_lane() == 0:
         found_inout.faces[p] = faces
 
@@ -99,7 +99,7 @@ def report_crossing_kernel(
     pair_count: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
-    found: Found,
+    found: NearestFound,
     hits: Hits,
     distances_out: Distances,
 ):

@@ -1,4 +1,4 @@
-"""What an object pair's search of distances starts from: boxes at unit size, errors to allow for, and a first bound.
+"""Start of a distance search: boxes at unit size, errors to allow for, and a first upper bound.
 
 Boxes are scaled by a power of two that brings the larger model, or the distance between the models' centres, to about
 unit size, so that float32 holds squares of distances. `margin` is that of `PairPose`, which widens boxes along an axis
@@ -29,6 +29,7 @@ from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import (
     ROUNDING_32,
     ROUNDING_64,
+    SCALE_MAX,
     UNIT_32,
     PairPose,
     measure_rotation,
@@ -39,7 +40,13 @@ from warp_abtree.kernels.search.item import pack_item
 from warp_abtree.kernels.search.load_balance import NO_UNIT, Work
 from warp_abtree.kernels.search.mean_slabs import Slabs, count_uses
 from warp_abtree.kernels.triangle.corners import load_triangles
-from warp_abtree.kernels.triangle.distance import DISTANCE_MAX, EXPONENT_BITS, POSE_ROUNDING, largest, skew_of
+from warp_abtree.kernels.triangle.distance import (
+    DISTANCE_MAX,
+    EXPONENT_BITS,
+    POSE_ROUNDING,
+    largest_coordinate,
+    skew_of,
+)
 from warp_abtree.kernels.triangle.triangle_pair import PAIR_ROUNDING, triangle_distance
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -52,12 +59,11 @@ BOUND_ROUNDING = wp.constant(wp.float64(2.0**-19))
 SMALL_DISTANCE = wp.constant(wp.float64(2.0**25))
 # Pairs, or depth of both trees, from which on slabs make a search shorter; else it takes as many steps, longer ones.
 PAIRS_LEAST, DEPTH_LEAST = wp.constant(24), wp.constant(36)
-SCALE_MAX = wp.constant(wp.float64(2.0**100))
 
 
 @wp.struct
-class Frame:
-    """How an object pair's boxes are compared, and what its distances err by."""
+class SearchScale:
+    """Scale and error bounds of an object pair's boxes and distances."""
 
     translation: wp.vec3  # between the models' centres, of B to A, scaled
     back: wp.vec3  # the same, of A to B
@@ -74,7 +80,7 @@ class Frame:
 
 @wp.struct
 class Tolerances:
-    """When a pair of faces is near enough."""
+    """Accepted widths of a distance's bracket."""
 
     tolerance: wp.float64  # width of the bracket [world units]
     relative: wp.float64  # width of the bracket, relative to its upper end
@@ -89,12 +95,12 @@ class Nearest:
 
 
 @wp.struct
-class Found:
-    """What the search of each object pair has found."""
+class NearestFound:
+    """Results of the search of each object pair."""
 
     distance: wp.array(dtype=wp.float64)  # in A's frame, shape [pair]
     faces: wp.array(dtype=wp.int64)  # see `Nearest`, shape [pair]; what lies there starts the next search
-    frame: wp.array(dtype=Frame)  # shape [pair]
+    scaling: wp.array(dtype=SearchScale)  # shape [pair]
     beyond: wp.array(dtype=wp.float64)  # distance to end at [world units], infinite for none, shape [pair]
     # What no nearest faces are beyond, scaled, and 0 where slabs do not pay, else 1; shape [pair], of warps alone.
     upper: wp.array(dtype=wp.vec2)
@@ -102,8 +108,8 @@ class Found:
 
 
 @wp.func
-def make_frame(models: ModelPool, states: StatePool, objects: ObjectPool, pose: PairPose, a: wp.int32, b: wp.int32):
-    """Return the `Frame` of objects a < b."""
+def make_scale(models: ModelPool, states: StatePool, objects: ObjectPool, pose: PairPose, a: wp.int32, b: wp.int32):
+    """Return the `SearchScale` of objects a < b."""
     state_a, state_b = objects.state[a], objects.state[b]
     centre_a, centre_b = models.centre[states.model[state_a]], models.centre[states.model[state_b]]
     root_a = load_node(states, states.node_start[state_a] + 1)
@@ -118,9 +124,9 @@ def make_frame(models: ModelPool, states: StatePool, objects: ObjectPool, pose: 
         back[i] = -sum_products(r[0, i], shift[0], r[1, i], shift[1], r[2, i], shift[2])
     skew, _ = measure_rotation(r)
     two = wp.float64(2.0)
-    size = largest(t) + largest(centre_a)
-    far = largest(shift)
-    margin64 = ROUNDING_64 * (size + two * (largest(centre_b) + reach_b) + reach_a)
+    size = largest_coordinate(t) + largest_coordinate(centre_a)
+    far = largest_coordinate(shift)
+    margin64 = ROUNDING_64 * (size + two * (largest_coordinate(centre_b) + reach_b) + reach_a)
     margin64 = margin64 + wp.float64(4.0) * skew * (reach_b + far)
     margin = margin64 + ROUNDING_32 * (reach_a + reach_b + far)
     most = wp.max(wp.max(reach_a, reach_b), far)
@@ -128,62 +134,62 @@ def make_frame(models: ModelPool, states: StatePool, objects: ObjectPool, pose: 
     scale = wp.min(wp.float64(1.0) / power, SCALE_MAX)
     one = wp.float64(1.0)
     skew_a, skew_b = skew_of(objects.rotation[a]), skew_of(objects.rotation[b])
-    sizes = (reach_a + largest(centre_a)) + (reach_b + largest(centre_b))
-    sizes = sizes + largest(objects.position[b] - objects.position[a])
-    frame = Frame()
-    frame.translation = wp.vec3(shift * scale)
-    frame.back = wp.vec3(back * scale)
-    frame.scale = wp.float32(scale)
-    frame.margin = wp.float32(margin * scale)
-    frame.scale64 = scale
-    frame.pair_slack = two * PAIR_ROUNDING * sizes
-    frame.grow = wp.float32(one + two * BOUND_ROUNDING + wp.float64(4.0) * skew)
-    frame.least = wp.float32(two * frame.pair_slack * scale)
+    sizes = (reach_a + largest_coordinate(centre_a)) + (reach_b + largest_coordinate(centre_b))
+    sizes = sizes + largest_coordinate(objects.position[b] - objects.position[a])
+    scaling = SearchScale()
+    scaling.translation = wp.vec3(shift * scale)
+    scaling.back = wp.vec3(back * scale)
+    scaling.scale = wp.float32(scale)
+    scaling.margin = wp.float32(margin * scale)
+    scaling.scale64 = scale
+    scaling.pair_slack = two * PAIR_ROUNDING * sizes
+    scaling.grow = wp.float32(one + two * BOUND_ROUNDING + wp.float64(4.0) * skew)
+    scaling.least = wp.float32(two * scaling.pair_slack * scale)
     off = UNIT_32 * (reach_a + wp.float64(7.2) * reach_b + wp.float64(4.0) * far) + margin64
-    frame.error = wp.float32((wp.float64(1.75) * off + two * frame.pair_slack) * scale)
-    frame.stretch = one + wp.float64(5.0) * (skew_a + skew_b) + POSE_ROUNDING
-    frame.slack = wp.float64(6.0) * skew_a * (reach_a + largest(centre_a)) + POSE_ROUNDING * sizes
-    return frame
+    scaling.error = wp.float32((wp.float64(1.75) * off + two * scaling.pair_slack) * scale)
+    scaling.stretch = one + wp.float64(5.0) * (skew_a + skew_b) + POSE_ROUNDING
+    scaling.slack = wp.float64(6.0) * skew_a * (reach_a + largest_coordinate(centre_a)) + POSE_ROUNDING * sizes
+    return scaling
 
 
 @wp.func
-def slack_of(frame: Frame, distance: wp.float64):
-    """Return what a distance errs by, beside a part of itself."""
-    return wp.where(distance > SMALL_DISTANCE * frame.pair_slack, frame.slack, frame.slack + frame.pair_slack)
+def slack_of(scaling: SearchScale, distance: wp.float64):
+    """Return the absolute error of a distance; `stretch` is the relative part."""
+    return wp.where(distance > SMALL_DISTANCE * scaling.pair_slack, scaling.slack, scaling.slack + scaling.pair_slack)
 
 
 @wp.func
-def width_of(frame: Frame, distance: wp.float64):
-    """Return what a bracket at a distance is at least as wide as, as `cut_of` takes it."""
-    return wp.float64(4.0) * ((frame.slack + frame.pair_slack) + (frame.stretch - wp.float64(1.0)) * distance)
+def width_of(scaling: SearchScale, distance: wp.float64):
+    """Return the least width of a bracket at a distance, see `cut_of`."""
+    return wp.float64(4.0) * ((scaling.slack + scaling.pair_slack) + (scaling.stretch - wp.float64(1.0)) * distance)
 
 
 @wp.func
-def cut_of(frame: Frame, tolerances: Tolerances, distance: wp.float64):
-    """Return the distance in A's frame under which faces matter, where there are some at a distance.
+def cut_of(scaling: SearchScale, tolerances: Tolerances, distance: wp.float64):
+    """Return the pruning distance in A's frame: faces beyond it cannot narrow the bracket at a distance.
 
     The bracket is as narrow as is asked then; where rounding alone makes it wider, faces that are any nearer matter.
     """
     asked = wp.max(tolerances.tolerance, tolerances.relative * distance)
-    spare = asked - width_of(frame, distance)
+    spare = asked - width_of(scaling, distance)
     return wp.where(spare > wp.float64(0.0), distance - spare, distance)
 
 
 @wp.func
-def scaled_up(distance: wp.float64, frame: Frame):
+def scaled_up(distance: wp.float64, scaling: SearchScale):
     """Return a distance in the scale of the boxes, not less than any pair of faces at it has in float64."""
-    return wp.float32(distance * frame.scale64) * ROUNDING_UP + frame.least
+    return wp.float32(distance * scaling.scale64) * ROUNDING_UP + scaling.least
 
 
 @wp.func
-def spare_of(tolerances: Tolerances, frame: Frame):
-    """Return tolerances for float32: scaled, relative, and widths of a bracket to be taken off, scaled and relative."""
-    width = width_of(frame, wp.float64(0.0))
-    part = wp.float64(4.0) * (frame.stretch - wp.float64(1.0))
+def tolerance_terms(tolerances: Tolerances, scaling: SearchScale):
+    """Return tolerances for float32: scaled, relative, and widths of a bracket to subtract, scaled and relative."""
+    width = width_of(scaling, wp.float64(0.0))
+    part = wp.float64(4.0) * (scaling.stretch - wp.float64(1.0))
     return wp.vec4(
-        wp.float32((tolerances.tolerance - width) * frame.scale64) * ROUNDING_DOWN,
+        wp.float32((tolerances.tolerance - width) * scaling.scale64) * ROUNDING_DOWN,
         wp.float32(tolerances.relative) * ROUNDING_DOWN,
-        wp.float32(width * frame.scale64) * ROUNDING_UP,
+        wp.float32(width * scaling.scale64) * ROUNDING_UP,
         wp.float32(part) * ROUNDING_UP,
     )
 
@@ -203,15 +209,15 @@ def start_pair(
     objects: ObjectPool,
     pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
-    found: Found,
+    found: NearestFound,
 ):
     """Prepare an object pair, with the last launch's faces as the first bound where both are active."""
     a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
     pose = pair_poses[p]
-    frame = make_frame(models, states, objects, pose, a, b)
+    scaling = make_scale(models, states, objects, pose, a, b)
     bound = found.beyond[p]
     if bound < DISTANCE_MAX:
-        bound = bound * frame.stretch + (frame.slack + frame.pair_slack)
+        bound = bound * scaling.stretch + (scaling.slack + scaling.pair_slack)
     else:
         bound = wp.float64(wp.inf)
     faces = found.faces[p]
@@ -223,16 +229,16 @@ def start_pair(
         if d <= bound:
             bound = d
             kept = pack_item(face_a, face_b)
-    found.frame[p] = frame
+    found.scaling[p] = scaling
     found.distance[p] = bound
     found.faces[p] = kept
     if p < found.upper.shape[0]:
-        found.upper[p] = wp.vec2(scaled_up(bound, frame), 1.0)
+        found.upper[p] = wp.vec2(scaled_up(bound, scaling), 1.0)
 
 
 @wp.func
-def wants_slabs(count: wp.int32, models: ModelPool, states: StatePool, a: wp.int32, b: wp.int32):
-    """Return whether a search by warps is shorter with slabs: many warps that share few pairs have the time anyway.
+def should_use_slabs(count: wp.int32, models: ModelPool, states: StatePool, a: wp.int32, b: wp.int32):
+    """Return whether slabs shorten a search by warps: not where many warps share few pairs.
 
     Args:
         a, b: Tree states of the object pair.
@@ -249,7 +255,7 @@ def start_distance_kernel(
     pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
     slabs_inout: Slabs,
-    found_inout: Found,
+    found_inout: NearestFound,
     work_out: Work,
 ):
     """Prepare an object pair a thread, see `start_pair`.
@@ -268,7 +274,7 @@ def start_distance_kernel(
     if p >= wp.min(pair_count[0], pairs.shape[0]) or found_inout.launched[0] == STALE:
         return
     a, b = objects.state[pairs[p][0]], objects.state[pairs[p][1]]
-    if wants_slabs(pair_count[0], models, states, a, b):
+    if should_use_slabs(pair_count[0], models, states, a, b):
         count_uses(p, models, states, objects, pairs, slabs_inout)
     else:
         slabs_inout.states[p] = wp.vec2i(-1, -1)

@@ -1,8 +1,8 @@
-"""Bounds of the distances of posed boxes, and the step of the search: a node pair, up to four pairs of children.
+"""Lower bounds of the distances of posed boxes, and the expansion of a node pair into up to four.
 
-Items are those of `traversal.node_pair`. Boxes are compared along the axes of both frames, as in `traversal.boxes`: in
+Items are those of `search.item`. Boxes are compared along the axes of both frames, as in `base.boxes`: in
 each frame the six gaps between a box and the other's image bound the distance, and the larger bound counts. Bounds are
-squares of twice the distance, scaled (`frame.Frame`). Where there are slabs, theirs count too (`slab_bound`).
+squares of twice the distance, scaled (`frame.SearchScale`). Where there are slabs, theirs count too (`slab_bound`).
 """
 
 import warp as wp
@@ -11,7 +11,7 @@ from warp_abtree.kernels.base.arrays import StatePool
 from warp_abtree.kernels.base.boxes import PosedBox, pose_box
 from warp_abtree.kernels.base.nodes import Node, load_constant_node
 from warp_abtree.kernels.base.poses import PairPose
-from warp_abtree.kernels.distance.frame import Frame
+from warp_abtree.kernels.distance.frame import SearchScale
 from warp_abtree.kernels.distance.slab_bound import bound_child_slabs, square_gap
 from warp_abtree.kernels.search.item import (
     DROPPED,
@@ -37,21 +37,21 @@ def bound_boxes(a: PosedBox, b: PosedBox):
 
 
 @wp.func
-def limit_of(frame: Frame, spare: wp.vec4, upper: wp.float32, held: wp.bool):
-    """Return the bound over which nothing matters any more: negative where all is known.
+def limit_of(scaling: SearchScale, terms: wp.vec4, upper: wp.float32, has_candidate: wp.bool):
+    """Return the pruning bound of a search, negative where nothing can improve it.
 
     Args:
-        spare: See `frame.spare_of`; counts where there are faces at most as far as upper.
+        terms: See `frame.tolerance_terms`; counts where there are faces at most as far as upper.
         upper: Scaled distance that the nearest faces are not beyond.
-        held: Whether there are such faces.
+        has_candidate: Whether there are such faces.
     """
     cut = upper
-    if held:
-        part = wp.max(spare[1] * upper - spare[2], spare[0])
-        cut = upper - wp.max(part - spare[3] * upper, 0.0)
+    if has_candidate:
+        part = wp.max(terms[1] * upper - terms[2], terms[0])
+        cut = upper - wp.max(part - terms[3] * upper, 0.0)
     if cut < 0.0:
         return wp.float32(-1.0)
-    x = 2.0 * (cut * frame.grow + frame.least)
+    x = 2.0 * (cut * scaling.grow + scaling.least)
     return x * x
 
 
@@ -62,14 +62,14 @@ def kind_of(used: wp.int32, a: Node, b: Node, bound: wp.float32, limit: wp.float
 
 
 @wp.func
-def bound_child_boxes(pose: PairPose, frame: Frame, a0: Node, a1: Node, b0: Node, b1: Node):
+def bound_child_boxes(pose: PairPose, scaling: SearchScale, a0: Node, a1: Node, b0: Node, b1: Node):
     """Return lower bounds of the squared distances of the four pairs of two nodes of A and two of B."""
     home = wp.transpose(pose.rotation32)
-    s = frame.scale
-    box_a0 = pose_box(a0.lower * s, a0.upper * s, home, frame.back, frame.margin)
-    box_a1 = pose_box(a1.lower * s, a1.upper * s, home, frame.back, frame.margin)
-    box_b0 = pose_box(b0.lower * s, b0.upper * s, pose.rotation32, frame.translation, frame.margin)
-    box_b1 = pose_box(b1.lower * s, b1.upper * s, pose.rotation32, frame.translation, frame.margin)
+    s = scaling.scale
+    box_a0 = pose_box(a0.lower * s, a0.upper * s, home, scaling.back, scaling.margin)
+    box_a1 = pose_box(a1.lower * s, a1.upper * s, home, scaling.back, scaling.margin)
+    box_b0 = pose_box(b0.lower * s, b0.upper * s, pose.rotation32, scaling.translation, scaling.margin)
+    box_b1 = pose_box(b1.lower * s, b1.upper * s, pose.rotation32, scaling.translation, scaling.margin)
     return wp.vec4(
         bound_boxes(box_a0, box_b0),
         bound_boxes(box_a0, box_b1),
@@ -84,12 +84,12 @@ def bound_children(
     states: StatePool,
     slabs: Slabs,
     pose: PairPose,
-    frame: Frame,
+    scaling: SearchScale,
     limit: wp.float32,
     item: wp.int64,
     live: wp.int32,
 ):
-    """Compare what an item names; return the items that follow, what each is, their bounds, and how many were compared.
+    """Expand an item; return the items that follow, their kinds, their bounds, and how many were compared.
 
     live is -1, or 0 where nothing is asked of the item, which still names nodes.
     """
@@ -102,9 +102,9 @@ def bound_children(
     b0, b1 = load_constant_node(states, at[2]), load_constant_node(states, at[3])
     bounds = wp.vec4()
     if with_slabs:
-        bounds = bound_child_slabs(slabs, pose, frame, at, a0, a1, b0, b1)
+        bounds = bound_child_slabs(slabs, pose, scaling, at, a0, a1, b0, b1)
     else:
-        bounds = bound_child_boxes(pose, frame, a0, a1, b0, b1)
+        bounds = bound_child_boxes(pose, scaling, a0, a1, b0, b1)
     kinds = wp.vec4i(
         kind_of(live, a0, b0, bounds[0], limit),
         kind_of(y & live, a0, b1, bounds[1], limit),

@@ -1,11 +1,11 @@
-"""What is reported of an object pair: its distance, the bracket around it, and the nearest points in the world."""
+"""Report of a distance search: the distance, the bracket around it, and the nearest points in the world."""
 
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool, load_vertex, no_vector
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.poses import PairPose, pose_point
-from warp_abtree.kernels.distance.frame import NO_FACES, Found, Tolerances, cut_of, slack_of
+from warp_abtree.kernels.distance.frame import NO_FACES, NearestFound, Tolerances, cut_of, slack_of
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.search.item import item_first, item_second
 from warp_abtree.kernels.triangle.corners import load_triangles
@@ -66,11 +66,11 @@ def report_pair(
     objects: ObjectPool,
     pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
-    found: Found,
+    found: NearestFound,
     hits: Hits,
     distances: Distances,
 ):
-    """Report an object pair; of those that intersect, what does not depend on where."""
+    """Report an object pair; of those that intersect only what needs no position."""
     zero = wp.float64(0.0)
     if hits.any_hit[p] != 0:
         distances.distance[p] = zero
@@ -83,12 +83,12 @@ def report_pair(
         distances.bracket[p] = wp.vec2d(beyond, wp.float64(wp.inf))
         write_nearest(p, 0, -1, -1, no_vector(), no_vector(), distances)
         return
-    frame = found.frame[p]
+    scaling = found.scaling[p]
     d = found.distance[p]
-    cut = cut_of(frame, tolerances, d)
-    lower = wp.max((cut - slack_of(frame, cut)) / frame.stretch, zero)
+    cut = cut_of(scaling, tolerances, d)
+    lower = wp.max((cut - slack_of(scaling, cut)) / scaling.stretch, zero)
     distances.distance[p] = wp.max(d, LEAST_DISTANCE)
-    distances.bracket[p] = wp.vec2d(lower, wp.max(d * frame.stretch + slack_of(frame, d), LEAST_DISTANCE))
+    distances.bracket[p] = wp.vec2d(lower, wp.max(d * scaling.stretch + slack_of(scaling, d), LEAST_DISTANCE))
     face_a, face_b = item_first(found.faces[p]), item_second(found.faces[p])
     near = nearest_features(load_triangles(models, states, pose, face_a, face_b))
     weights_a, weights_b = feature_weights(near)
@@ -109,7 +109,7 @@ def report_distance_kernel(
     pair_count: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
-    found: Found,
+    found: NearestFound,
     hits: Hits,
     distances_out: Distances,
 ):

@@ -1,4 +1,4 @@
-"""The search of two trees for their nearest faces: depth first, the nearest children first, by warps that share work.
+"""Branch and bound for the nearest faces of two trees: depth first, nearest children first, by warps that share work.
 
 Node pairs are dropped where their boxes are farther apart than the nearest pair of faces that any warp has found so
 far; never where a pair of faces below may be as near, so that the nearest distance, and of equally near faces the
@@ -20,7 +20,14 @@ from warp_abtree.kernels.base.lanes import (
     warp_sync,
 )
 from warp_abtree.kernels.base.poses import PairPose
-from warp_abtree.kernels.distance.frame import NO_FACES, Found, Frame, Tolerances, scaled_up, spare_of
+from warp_abtree.kernels.distance.frame import (
+    NO_FACES,
+    NearestFound,
+    SearchScale,
+    Tolerances,
+    scaled_up,
+    tolerance_terms,
+)
 from warp_abtree.kernels.distance.node_pair import bound_children, limit_of
 from warp_abtree.kernels.distance.warp_found import (
     SLABS_PAY,
@@ -44,7 +51,7 @@ from warp_abtree.kernels.search.load_balance import (
     receive_items,
     take_unit,
 )
-from warp_abtree.kernels.search.mean_slabs import Slabs, has_slabs
+from warp_abtree.kernels.search.mean_slabs import Slabs, has_mean_slabs
 from warp_abtree.kernels.search.nearest_stack import (
     OPEN_LENGTH,
     OPEN_START,
@@ -63,7 +70,7 @@ MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
 # Fewer items than the traversal gives away: far more lies below one.
-DONATION_LEAST = wp.constant(4)
+SEARCH_DONATION_LEAST = wp.constant(4)
 
 
 # Face pairs from which on it is known whether slabs pay, and items for three of them that they leave where they do.
@@ -74,11 +81,11 @@ DIVE_ITEMS = wp.constant(8)
 
 @wp.struct
 class Search:
-    """An object pair, and how a warp looks for its nearest faces."""
+    """Search of a warp for the nearest faces of an object pair."""
 
     pair: wp.int32  # its number
     pose: PairPose  # of B in A's frame
-    frame: Frame  # how boxes are compared
+    scaling: SearchScale  # how boxes are compared
     tolerances: Tolerances  # when they are near enough
     room: wp.int32  # items that the stack takes, STACK_LENGTH at most
     slabs: wp.bool  # whether there are some of both states
@@ -95,19 +102,19 @@ def bound_waiting(
     search: Search,
     models: ModelPool,
     states: StatePool,
-    found: Found,
+    found: NearestFound,
 ):
-    """Measure face pairs in float32, one a lane; keep those that may be nearest, and return how many there are."""
+    """Bound face pairs in float32, one a lane; keep those that may be nearest, and return how many there are."""
     at = STACK_LENGTH + first + wp.min(warp_lane(), popped - 1)
     item = read_item(items, at)
     live = warp_lane() < popped and read_bound(items, at) <= limit
     warp_sync()
     between = wp.vec2(wp.inf, wp.inf)
     if live:
-        pose, frame = search.pose, search.frame
+        pose, scaling = search.pose, search.scaling
         face_a, face_b = item_first(item), item_second(item)
-        a, b = load_points(models, states, pose, frame.translation, frame.scale, face_a, face_b)
-        between = bound_faces(search.frame.error, a, b)
+        a, b = load_points(models, states, pose, scaling.translation, scaling.scale, face_a, face_b)
+        between = bound_faces(search.scaling.error, a, b)
     least = warp_min32(between[1])
     if least < upper:
         lower_upper(found.upper, search.pair, UPPER, least)
@@ -126,9 +133,9 @@ def decide_open(
     models: ModelPool,
     states: StatePool,
     pair_poses: wp.array(dtype=PairPose),
-    found: Found,
+    found: NearestFound,
 ):
-    """Measure in float64 what face pairs may still be nearest, one a lane.
+    """Measure in float64 the face pairs that may still be nearest, one a lane.
 
     The pose in float64 is loaded here, so that the search need not keep it in registers.
     """
@@ -144,7 +151,7 @@ def decide_open(
         lowest = warp_min_item(wp.where(d == least, item, NO_FACES))
         if least <= load_distance(found.distance, pair):
             offer_nearest(found.distance, found.faces, pair, least, lowest)
-            lower_upper(found.upper, pair, UPPER, scaled_up(least, found.frame[pair]))
+            lower_upper(found.upper, pair, UPPER, scaled_up(least, found.scaling[pair]))
 
 
 @wp.func
@@ -159,7 +166,7 @@ def expand_nearest(
     slabs: Slabs,
     search: Search,
 ):
-    """Compare what items first to first + popped name, one a lane.
+    """Expand items first to first + popped, one a lane.
 
     Returns both ends, see `push_nearest`, and how many were compared.
     """
@@ -168,7 +175,7 @@ def expand_nearest(
     live = wp.where(warp_lane() < popped and read_bound(items, at) <= limit, -1, 0)
     warp_sync()
     children, kinds, bounds, compared = bound_children(
-        with_slabs, states, slabs, search.pose, search.frame, limit, item, live
+        with_slabs, states, slabs, search.pose, search.scaling, limit, item, live
     )
     ends = push_nearest(items, first, waiting, kinds, children, bounds)
     warp_sync()
@@ -177,7 +184,7 @@ def expand_nearest(
 
 @wp.func
 def slabs_pay(faces: wp.int32, items: wp.int32):
-    """Return whether slabs leave few face pairs, as seen so far: of nested parts they leave as many as boxes do."""
+    """Return whether slabs leave few face pairs, as counted so far: not for nested parts."""
     return faces < MANY_FACES or faces < FEW_FACES * (items / 3)
 
 
@@ -191,27 +198,29 @@ def search_items(
     pair_poses: wp.array(dtype=PairPose),
     slabs: Slabs,
     # state
-    found: Found,
+    found: NearestFound,
     work: Work,
 ):
-    """Search so many items on the stack that are not given away; return what this lane compared: boxes and faces."""
-    items, pair, frame = nearest_stack(), search.pair, search.frame
+    """Search so many items of the stack, less those donated; return this lane's tests of boxes and of faces."""
+    items, pair, scaling = nearest_stack(), search.pair, search.scaling
     head, end, waiting, opened = wp.int32(0), wp.int32(count), wp.int32(0), wp.int32(0)
     tests, seen = wp.vec2i(), wp.vec2i()
-    held = load_faces(found.faces, pair) != NO_FACES
+    has_candidate = load_faces(found.faces, pair) != NO_FACES
     # Bounds under it are of faces that are as near as is asked.
-    beyond = wp.float32(load_distance(found.distance, pair) * frame.scale64) * ROUNDING_DOWN
-    spare = spare_of(search.tolerances, frame)
+    beyond = wp.float32(load_distance(found.distance, pair) * scaling.scale64) * ROUNDING_DOWN
+    terms = tolerance_terms(search.tolerances, scaling)
     while end > head or waiting > 0 or opened > 0:
         tickets = load_tickets(work.counter)
         known = load_upper(found.upper, pair)
         upper, with_slabs = known[UPPER], search.slabs and known[SLABS_PAY] > 0.0
-        held = held or upper < beyond
-        limit = limit_of(frame, spare, upper, held)
+        has_candidate = has_candidate or upper < beyond
+        limit = limit_of(scaling, terms, upper, has_candidate)
         if end > head and waiting < warp_size():
             # One at a time, depth first, needs little room; more where there is.
             popped = wp.max(1, (search.room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
-            popped = wp.min(popped, wp.min(wp.where(held, warp_size(), wp.min(DIVE_ITEMS, warp_size())), end - head))
+            popped = wp.min(
+                popped, wp.min(wp.where(has_candidate, warp_size(), wp.min(DIVE_ITEMS, warp_size())), end - head)
+            )
             end -= popped
             seen[0] += popped
             ends, compared = expand_nearest(items, end, popped, waiting, limit, with_slabs, states, slabs, search)
@@ -219,7 +228,7 @@ def search_items(
             waiting = item_first(ends)
             tests[0] += compared
         # The first face pairs are measured at once: until then, nothing is dropped.
-        if waiting >= warp_size() or (waiting > 0 and (end == head or not held)):
+        if waiting >= warp_size() or (waiting > 0 and (end == head or not has_candidate)):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
             seen[1] += popped
@@ -235,14 +244,14 @@ def search_items(
             upper = load_upper(found.upper, pair)[UPPER]
             decide_open(items, opened, popped, upper, pair, models, states, pair_poses, found)
         idle = count_idle(tickets)
-        if idle > 0 and end - head >= 2 * DONATION_LEAST:
-            head = donate_items(DONATION_LEAST, pair, idle, items, head, end, work)
+        if idle > 0 and end - head >= 2 * SEARCH_DONATION_LEAST:
+            head = donate_items(SEARCH_DONATION_LEAST, pair, idle, items, head, end, work)
     return tests
 
 
 @wp.func
-def start_items(slot: wp.int32, states: StatePool, pose: PairPose, work: Work):
-    """Put both roots on the empty stack, or what lies in a slot, 0 or more; return how many items."""
+def start_search_items(slot: wp.int32, states: StatePool, pose: PairPose, work: Work):
+    """Push both roots, or the donated items of a slot, 0 or more, on the empty stack; return how many items."""
     items = nearest_stack()
     size = wp.int32(1)
     if slot >= 0:
@@ -264,7 +273,7 @@ def search_warp_kernel(
     pair_count: wp.array(dtype=wp.int32),
     pair_poses: wp.array(dtype=PairPose),
     slabs_inout: Slabs,
-    found_inout: Found,
+    found_inout: NearestFound,
     hits_inout: Hits,
     work_inout: Work,
 ):
@@ -291,9 +300,9 @@ def search_warp_kernel(
         if hits_inout.any_hit[p] == 0:
             search.pair = p
             search.pose = pair_poses[p]
-            search.frame = found_inout.frame[p]
-            search.slabs = has_slabs(states, slabs_inout, p)
-            size = start_items(slot, states, search.pose, work_inout)
+            search.scaling = found_inout.scaling[p]
+            search.slabs = has_mean_slabs(states, slabs_inout, p)
+            size = start_search_items(slot, states, search.pose, work_inout)
             tests = search_items(search, size, models, states, pair_poses, slabs_inout, found_inout, work_inout)
             add_warp_sum(hits_inout.node_tests, p, tests[0])
             add_warp_sum(hits_inout.triangle_tests, p, tests[1])

@@ -1,4 +1,4 @@
-"""The search of the CPU: threads that take one object pair after the other, in vector instructions.
+"""Branch and bound for the nearest faces on the CPU: an object pair a thread, in vector instructions.
 
 Node pairs go depth first, but those that are far for what has been found wait until something nearer may be: few are
 looked at then that a search from the answer would not. Faces are measured in float32, 16 at a time, within an error
@@ -14,19 +14,19 @@ from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.distance.frame import (
     NO_FACES,
-    Found,
-    Frame,
     Nearest,
+    NearestFound,
+    SearchScale,
     Tolerances,
     scaled_up,
-    spare_of,
     start_pair,
+    tolerance_terms,
 )
 from warp_abtree.kernels.distance.report import Distances, report_pair
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
 from warp_abtree.kernels.search.load_balance import take_thread, take_unit
-from warp_abtree.kernels.search.mean_slabs import Slabs, count_uses, has_slabs, make_due
+from warp_abtree.kernels.search.mean_slabs import Slabs, count_uses, has_mean_slabs, make_due
 from warp_abtree.kernels.triangle.corners import load_triangles
 from warp_abtree.kernels.triangle.triangle_pair import triangle_distance
 
@@ -60,8 +60,8 @@ def search_nearest(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    frame: Frame,
-    spare: wp.vec4,
+    scaling: SearchScale,
+    terms: wp.vec4,
     slabs: Slabs,
     with_slabs: bool,
     thread: wp.int32,
@@ -83,20 +83,20 @@ def take_nearest(upper: wp.float32, thread: wp.int32, memory: wp.array2d(dtype=w
 
 
 @wp.func
-def decide_open(
+def decide_waiting(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    frame: Frame,
+    scaling: SearchScale,
     thread: wp.int32,
     before: Nearest,
     memory: wp.array2d(dtype=wp.float32),
 ):
-    """Measure in float64 what waits, the nearest first, as far as it matters; return the nearest."""
+    """Measure in float64 the faces that wait, the nearest first, while they can improve; return the nearest."""
     nearest = before
     searching = bool(True)
     while searching:
-        item = take_nearest(scaled_up(nearest.distance, frame), thread, memory)
+        item = take_nearest(scaled_up(nearest.distance, scaling), thread, memory)
         searching = item >= wp.int64(0)
         if searching:
             d = triangle_distance(load_triangles(models, states, pose, item_first(item), item_second(item)))
@@ -107,8 +107,8 @@ def decide_open(
 
 
 @wp.struct
-class Asked:
-    """The object pairs of a launch, and how near their distances are to be."""
+class SearchRequest:
+    """Object pairs of a launch, and the tolerances of their distances."""
 
     pair_count: wp.array(dtype=wp.int32)  # shape (1,)
     pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]
@@ -122,12 +122,12 @@ class Asked:
 def search_pair(
     p: wp.int32,
     before: wp.float64,
-    asked: Asked,
+    request: SearchRequest,
     models: ModelPool,
     states: StatePool,
     slabs: Slabs,
     thread: wp.int32,
-    found: Found,
+    found: NearestFound,
     hits: Hits,
     memory: wp.array2d(dtype=wp.float32),
 ):
@@ -139,18 +139,18 @@ def search_pair(
     Args:
         before: Distance that the last launch found, NaN where the faces are not of it.
     """
-    pose = asked.pair_poses[p]
-    frame = found.frame[p]
+    pose = request.pair_poses[p]
+    scaling = found.scaling[p]
     nearest = Nearest()
     nearest.distance = found.distance[p]
     nearest.faces = found.faces[p]
     diving = nearest.distance == wp.float64(wp.inf)
     if nearest.faces != NO_FACES:
         diving = nearest.distance > wp.float64(2.0) * before or before > wp.float64(2.0) * nearest.distance
-    with_slabs = has_slabs(states, slabs, p)
-    spare = spare_of(asked.tolerances, frame)
+    with_slabs = has_mean_slabs(states, slabs, p)
+    terms = tolerance_terms(request.tolerances, scaling)
     open_search(
-        scaled_up(nearest.distance, frame),
+        scaled_up(nearest.distance, scaling),
         nearest.faces != NO_FACES,
         diving,
         first_item(states, pose),
@@ -159,8 +159,8 @@ def search_pair(
     )
     state = wp.vec3i()
     while state[0] == 0:
-        state = search_nearest(models, states, pose, frame, spare, slabs, with_slabs, thread, memory)
-        nearest = decide_open(models, states, pose, frame, thread, nearest, memory)
+        state = search_nearest(models, states, pose, scaling, terms, slabs, with_slabs, thread, memory)
+        nearest = decide_waiting(models, states, pose, scaling, thread, nearest, memory)
     hits.node_tests[p] += wp.int64(state[1])
     hits.triangle_tests[p] += wp.int64(state[2])
     found.distance[p] = nearest.distance
@@ -169,13 +169,13 @@ def search_pair(
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
 def search_thread_kernel(
-    asked: Asked,
+    request: SearchRequest,
     models: ModelPool,
     states: StatePool,
     objects: ObjectPool,
     counter_inout: wp.array(dtype=wp.int32),
     slabs_inout: Slabs,
-    found_inout: Found,
+    found_inout: NearestFound,
     hits_inout: Hits,
     distances_out: Distances,
     memory_out: wp.array2d(dtype=wp.float32),
@@ -186,16 +186,16 @@ def search_thread_kernel(
     """
     if found_inout.launched[0] == STALE:
         return
-    pairs, poses = asked.pairs, asked.pair_poses
-    count = wp.min(asked.pair_count[0], poses.shape[0])
-    if asked.refreshes:
+    pairs, poses = request.pairs, request.pair_poses
+    count = wp.min(request.pair_count[0], poses.shape[0])
+    if request.refreshes:
         for i in range(counter_inout.shape[0]):
             counter_inout[i] = 0
         slabs_inout.due_count[0] = 0
         for i in range(count):
             count_uses(i, models, states, objects, pairs, slabs_inout)
         make_due(0, 1, 0, 1, models, states, slabs_inout)
-    if not asked.searches:
+    if not request.searches:
         return
     thread = take_thread(counter_inout)
     if thread >= memory_out.shape[0]:
@@ -205,6 +205,8 @@ def search_thread_kernel(
         before = found_inout.distance[p]
         start_pair(p, models, states, objects, pairs, poses, found_inout)
         if hits_inout.any_hit[p] == 0:
-            search_pair(p, before, asked, models, states, slabs_inout, thread, found_inout, hits_inout, memory_out)
-        report_pair(p, asked.tolerances, models, states, objects, pairs, poses, found_inout, hits_inout, distances_out)
+            search_pair(p, before, request, models, states, slabs_inout, thread, found_inout, hits_inout, memory_out)
+        report_pair(
+            p, request.tolerances, models, states, objects, pairs, poses, found_inout, hits_inout, distances_out
+        )
         p = take_unit(counter_inout)

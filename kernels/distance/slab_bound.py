@@ -1,4 +1,4 @@
-"""Bounds of the distances of two nodes by slabs and boxes together, for a lane of a warp.
+"""Lower bounds of the distances of two nodes by slabs and boxes together, for a lane of a warp.
 
 Along a direction, a node reaches no farther than its slab and its box do; across it, no farther than a ball about its
 box's centre; docs/exactness.md has the margins. The direction joins the nodes' middles, turned a little towards their
@@ -12,14 +12,14 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.boxes import fuse32, map_point
 from warp_abtree.kernels.base.nodes import Node, load_constant
 from warp_abtree.kernels.base.poses import PairPose
-from warp_abtree.kernels.distance.frame import Frame
+from warp_abtree.kernels.distance.frame import SearchScale
 from warp_abtree.kernels.search.mean_slabs import Slabs
 from warp_abtree.kernels.search.slab_overlap import add_product, take_multiple
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Margins of boxes that a bound leaves off, of twice the distance.
-MARGINS = wp.constant(wp.float32(native.constant("SLAB_MARGINS")))
+BOUND_MARGINS = wp.constant(wp.float32(native.constant("SLAB_MARGINS")))
 # How much the sums of two nodes' normals count for the direction, beside what joins their middles; as was counted.
 NORMAL_WEIGHT = wp.constant(wp.float32(0.0625))
 
@@ -38,7 +38,7 @@ class Body:
 
 @wp.func
 def square_gap(x: wp.vec3, reach: wp.vec3):
-    """Return the squared length of what |x| exceeds a reach by."""
+    """Return the squared length of the excess of |x| over a reach."""
     zero = wp.float32(0.0)
     a = wp.max(wp.abs(x[0]) - reach[0], zero)
     b = wp.max(wp.abs(x[1]) - reach[1], zero)
@@ -68,7 +68,7 @@ def load_body(slabs: Slabs, at: wp.int32, node: Node, scale: wp.float32):
 
 
 @wp.func
-def top_of(body: Body, n: wp.vec3):
+def body_top(body: Body, n: wp.vec3):
     """Return twice an upper bound of n . x for the points x of a node, in its own frame."""
     along = add_product(n, body.normal, 0.0)
     rest = take_multiple(n, along, body.normal)
@@ -82,7 +82,7 @@ def top_of(body: Body, n: wp.vec3):
 
 @wp.func
 def reach_there(rotation: wp.mat33, size: wp.vec3, margin: wp.float32):
-    """Return the width of a box's image in the other frame, wider by a margin on either side."""
+    """Return the width of a box's image in the other frame, widened by a margin on either side."""
     reach = wp.vec3()
     for i in range(3):
         x = fuse32(wp.abs(rotation[i, 2]), size[2], margin + margin)
@@ -119,25 +119,32 @@ def bound_pair(n: wp.vec3, gap: wp.float32, margin: wp.float32, apart: wp.vec3, 
 
 @wp.func
 def bound_child_slabs(
-    slabs: Slabs, pose: PairPose, frame: Frame, at: wp.vec4i, node_a0: Node, node_a1: Node, node_b0: Node, node_b1: Node
+    slabs: Slabs,
+    pose: PairPose,
+    scaling: SearchScale,
+    at: wp.vec4i,
+    node_a0: Node,
+    node_a1: Node,
+    node_b0: Node,
+    node_b1: Node,
 ):
     """Return lower bounds of the squares of twice the distances of the four pairs of nodes of A and B.
 
     Args:
         at: Where the nodes lie in the pool.
     """
-    s, rotation, margin = frame.scale, pose.rotation32, MARGINS * frame.margin
+    s, rotation, margin = scaling.scale, pose.rotation32, BOUND_MARGINS * scaling.margin
     a0, a1 = load_body(slabs, at[0], node_a0, s), load_body(slabs, at[1], node_a1, s)
     b0, b1 = load_body(slabs, at[2], node_b0, s), load_body(slabs, at[3], node_b1, s)
-    shift = frame.translation + frame.translation
+    shift = scaling.translation + scaling.translation
     there0, there1 = map_point(rotation, shift, b0.sum), map_point(rotation, shift, b1.sum)
     normal_b = map_point(rotation, wp.vec3(), b0.normal + b1.normal)
     n = direction_of((there0 + there1) - (a0.sum + a1.sum), a0.normal + a1.normal, normal_b)
     back = -map_point(wp.transpose(rotation), wp.vec3(), n)
     far = wp.dot(shift, n)
-    far0, far1 = far - top_of(b0, back), far - top_of(b1, back)
-    top0, top1 = top_of(a0, n), top_of(a1, n)
-    reach0, reach1 = reach_there(rotation, b0.size, frame.margin), reach_there(rotation, b1.size, frame.margin)
+    far0, far1 = far - body_top(b0, back), far - body_top(b1, back)
+    top0, top1 = body_top(a0, n), body_top(a1, n)
+    reach0, reach1 = reach_there(rotation, b0.size, scaling.margin), reach_there(rotation, b1.size, scaling.margin)
     d00, d01, d10, d11 = there0 - a0.sum, there1 - a0.sum, there0 - a1.sum, there1 - a1.sum
     return wp.vec4(
         bound_pair(n, far0 - top0, margin, d00, a0.ball + b0.ball, square_gap(d00, a0.size + reach0)),

@@ -1,4 +1,4 @@
-"""What all warps that search an object pair have found, read and written while others do."""
+"""Upper bounds and nearest faces shared by all warps that search an object pair, by atomics."""
 
 import functools
 

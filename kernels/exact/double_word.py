@@ -72,7 +72,7 @@ def double_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
 
 @wp.func
 def round_double(value: wp.vec2d, bound: wp.float64):
-    """Return the float64 number next to what a double word stands for within a bound; NaN where that leaves two."""
+    """Round a double word within a bound of its value to float64; NaN where the bound leaves two numbers."""
     # Twice the bound, for the rounding of these sums.
     above = value[0] + (value[1] + wp.float64(2.0) * bound)
     below = value[0] + (value[1] - wp.float64(2.0) * bound)

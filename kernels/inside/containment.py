@@ -1,4 +1,4 @@
-"""Which object pairs intersect because one holds a component of the other, though their surfaces do not cross.
+"""Containment: object pairs of which one holds a component of the other, though their surfaces do not cross.
 
 Surfaces that do not meet leave each component of one wholly inside or wholly outside the other, so one corner of each
 component decides.
@@ -40,7 +40,7 @@ def find_inside(
     of_b: bool,
     centre: wp.vec3d,
 ):
-    """Return the lowest face that stands for a component inside the solid A, or B, of the other's state; or NO_FACE."""
+    """Return the lowest face that represents a component inside the solid A, or B, of the other's state; or NO_FACE."""
     lowest = wp.int32(NO_FACE)
     i = wp.int32(0)
     while i < solids.count[state]:
@@ -70,7 +70,7 @@ def find_contained_kernel(
     near_hit_inout: wp.array(dtype=wp.int32),
     contained_out: wp.array(dtype=wp.int32),
 ):
-    """Find what is inside of the pairs whose surfaces do not meet, a thread a pair.
+    """Find contained components of the pairs whose surfaces do not meet, a thread a pair.
 
     Args:
         near_hit_inout: Whether each pair is near, shape [pair]; [0] where no distance was asked.
@@ -112,7 +112,7 @@ def report_contained_kernel(
     contained: wp.array(dtype=wp.int32),
     distances_out: Distances,
 ):
-    """Report a corner of what is inside, and its face, of the pairs that intersect in this way, a thread a pair."""
+    """Report a corner and its face of the contained component of pairs that intersect in this way, a thread a pair."""
     p = wp.tid()
     if p >= pair_count[0] or launched[0] == STALE:
         return

@@ -1,6 +1,6 @@
-"""How deep an object pair is: the greatest depth of samples of one surface inside the other object, a solid.
+"""Depth of an object pair by branch and bound: the greatest of samples of one surface inside the other, a solid.
 
-A motion shorter than the depth of a sample (`solid.samples`) leaves it inside, so the greatest depth is a lower bound
+A motion shorter than the depth of a sample (`inside.samples`) leaves it inside, so the greatest depth is a lower bound
 of any motion that frees the two. Nodes of the tree whose samples are looked at are dropped where, by the distance of
 their middle from the surface, nothing below can be inside, or deeper than what is known; never where it may be as deep,
 so that the deepest sample, the lowest of several, is found in any order.
@@ -13,23 +13,22 @@ from warp_abtree.kernels.base.boxes import round_up
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.lanes import warp_lane, warp_max, warp_min_item, warp_size, warp_sync
 from warp_abtree.kernels.base.nodes import Node, load_node
-from warp_abtree.kernels.base.poses import PairPose, pose_point
-from warp_abtree.kernels.distance.frame import Frame, make_frame, slack_of
+from warp_abtree.kernels.base.poses import HALF, PairPose, pose_point
+from warp_abtree.kernels.distance.frame import SearchScale, make_scale, slack_of
 from warp_abtree.kernels.distance.report import Distances, blend_corners, write_nearest
 from warp_abtree.kernels.inside.components import Solids
 from warp_abtree.kernels.inside.nearest_face import (
     NO_NEAREST,
-    Whose,
+    Solid,
     into_frame,
-    make_whose,
+    make_solid,
     nearest_face,
     point_features,
     point_weights,
     square_outside,
 )
-from warp_abtree.kernels.inside.parity import face_corners, is_inside
+from warp_abtree.kernels.inside.parity import is_inside, load_posed_face
 from warp_abtree.kernels.inside.samples import (
-    HALF,
     KNOWN,
     NO_SAMPLE,
     SAMPLES,
@@ -54,14 +53,14 @@ def bound_depth(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    inner: Whose,
-    outer: Whose,
+    inner: Solid,
+    outer: Solid,
     node: Node,
     hint: wp.int32,
     known: wp.float64,
     sampling: Sampling,
 ):
-    """Return an upper bound of the depth below a node, negative only where it is less than what is known, and a face.
+    """Return an upper bound of the depth below a node, negative only if less than what is known, and a face.
 
     With the node's middle at a distance d from the surface, and points within r of it, an inside point is no deeper
     than d + r, and no deeper than r - d where the middle is outside: the surface lies between them.
@@ -97,7 +96,7 @@ def bound_depth(
 
 @wp.func
 def agree(best: Deepest):
-    """Return the deepest of what all lanes have found, the lowest of several."""
+    """Return the deepest sample of all lanes, the lowest of several."""
     found = Deepest()
     found.depth = warp_max(best.depth)
     found.item = warp_min_item(wp.where(best.depth == found.depth, best.item, NO_SAMPLE))
@@ -105,17 +104,17 @@ def agree(best: Deepest):
 
 
 @wp.func
-def find_deepest(
+def find_deepest_sample(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    inner: Whose,
-    outer: Whose,
+    inner: Solid,
+    outer: Solid,
     room: wp.int32,
     known: Deepest,
     sampling: Sampling,
 ):
-    """Return the deepest of what is known and all samples of one object inside the other, the same in all lanes.
+    """Return the deepest of a known sample and all samples of one object inside the other, the same in all lanes.
 
     The children that may be deepest come first; faces wait until there is one for each lane. An item names a node or a
     face, and the outer face that was nearest above it, where the next search starts.
@@ -173,22 +172,22 @@ def deepest_of_both(
     states: StatePool,
     pose: PairPose,
     solids: Solids,
-    first: Whose,
-    second: Whose,
+    first: Solid,
+    second: Solid,
     pair: wp.vec2i,
     room: wp.int32,
     known: Deepest,
     sampling: Sampling,
 ):
-    """Return the deepest of what is known and all samples of either object inside the other, where that is a solid."""
+    """Return the deepest of a known sample and all samples of either object inside the other, where that is a solid."""
     best = known
     if solids.is_solid[wp.max(pair[0], pair[1])] != 0:
-        best = find_deepest(models, states, pose, first, second, room, known, sampling)
+        best = find_deepest_sample(models, states, pose, first, second, room, known, sampling)
     if solids.is_solid[wp.min(pair[0], pair[1])] != 0:
         other = Deepest()
         other.depth = best.depth
         other.item = KNOWN
-        other = find_deepest(models, states, pose, second, first, room, other, sampling)
+        other = find_deepest_sample(models, states, pose, second, first, room, other, sampling)
         if other.item != KNOWN:
             best = other
             best.of_b = True
@@ -205,9 +204,9 @@ def deepest_points(
     nearest = wp.int32(best.item & wp.int64(0x3FFFFFFF))
     a, b = wp.min(pair[0], pair[1]), wp.max(pair[0], pair[1])
     inner, outer = wp.where(best.of_b, b, a), wp.where(best.of_b, a, b)
-    u, v, w = face_corners(models, states, pose, best.of_b, face)
+    u, v, w = load_posed_face(models, states, pose, best.of_b, face)
     point = (weights[0] * u + weights[1] * v) + weights[2] * w
-    u, v, w = face_corners(models, states, pose, not best.of_b, nearest)
+    u, v, w = load_posed_face(models, states, pose, not best.of_b, nearest)
     near, _size = point_features(u, v, w, point)
     ids = states.face_corner[states.face_start[objects.state[outer]] + nearest]
     foot = blend_corners(models, ids, point_weights(near))
@@ -224,7 +223,7 @@ def report_deepest(
     states: StatePool,
     objects: ObjectPool,
     pose: PairPose,
-    frame: Frame,
+    scaling: SearchScale,
     pair: wp.vec2i,
     best: Deepest,
     p: wp.int32,
@@ -235,10 +234,10 @@ def report_deepest(
     face = wp.int32(best.item >> wp.int64(33))
     nearest = wp.int32(best.item & wp.int64(0x3FFFFFFF))
     d = best.depth
-    slack = slack_of(frame, d)
-    least = wp.max((d - slack) / frame.stretch, wp.float64(0.0))
+    slack = slack_of(scaling, d)
+    least = wp.max((d - slack) / scaling.stretch, wp.float64(0.0))
     distances.distance[p] = -d
-    distances.bracket[p] = wp.vec2d(-(d * frame.stretch + slack), -least)
+    distances.bracket[p] = wp.vec2d(-(d * scaling.stretch + slack), -least)
     if best.of_b:
         write_nearest(p, pose.swapped, nearest, face, foot, sample, distances)
     else:
@@ -275,13 +274,13 @@ def find_depth_kernel(
     if solids.is_solid[a] == 0 and solids.is_solid[b] == 0:
         return
     pose = pair_poses[p]
-    frame = make_frame(models, states, objects, pose, a, b)
-    first = make_whose(models, states, pose, frame, False, objects.state[a])
-    second = make_whose(models, states, pose, frame, True, objects.state[b])
+    scaling = make_scale(models, states, objects, pose, a, b)
+    first = make_solid(models, states, pose, scaling, False, objects.state[a])
+    second = make_solid(models, states, pose, scaling, True, objects.state[b])
     best = Deepest()
     best.item = KNOWN
     sampling = Sampling()
     sampling.samples = SAMPLES
     best = deepest_of_both(models, states, pose, solids, first, second, pairs[p], room, best, sampling)
     if best.item != KNOWN and warp_lane() == 0:
-        report_deepest(models, states, objects, pose, frame, pairs[p], best, p, distances_inout)
+        report_deepest(models, states, objects, pose, scaling, pairs[p], best, p, distances_inout)

@@ -1,9 +1,9 @@
-"""Contact points of what lies inside a solid: how deep it is where faces that cross or are near do not tell.
+"""Contact points of what lies inside a solid, beyond the reach of faces that cross or are near.
 
 A contact knows depth as far as its two faces reach, and a gap as far as the gap. What has gone under farther, or lies
-inside whole, has samples (`solid.depth`) deeper than any point of its pair; the deepest of these, far from one another,
-become points: depth is the distance from the other's surface, the normal the way there. They take the places of
-the nearest other points where there is no room.
+inside whole, has samples (`inside.depth`) deeper than any point of its pair; the deepest of these, far from one
+another, become points: depth is the distance from the other's surface, the normal the way there. They take the
+places of the nearest other points where there is no room.
 """
 
 import warp as wp
@@ -12,16 +12,16 @@ from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.lanes import warp_lane, warp_size
 from warp_abtree.kernels.base.nodes import load_node
-from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.base.poses import HALF, PairPose, pose_point
 from warp_abtree.kernels.contacts.manifold import Manifolds
 from warp_abtree.kernels.contacts.points import order_direction
-from warp_abtree.kernels.distance.frame import make_frame
+from warp_abtree.kernels.distance.frame import make_scale
 from warp_abtree.kernels.inside.components import Solids
 from warp_abtree.kernels.inside.containment import FIRST_INSIDE, SECOND_INSIDE
 from warp_abtree.kernels.inside.depth import MODULE_OPTIONS, deepest_of_both, deepest_points
-from warp_abtree.kernels.inside.nearest_face import NO_NEAREST, Whose, make_whose, nearest_face
+from warp_abtree.kernels.inside.nearest_face import NO_NEAREST, Solid, make_solid, nearest_face
 from warp_abtree.kernels.inside.parity import is_inside
-from warp_abtree.kernels.inside.samples import AVOIDED_MAX, HALF, KNOWN, Deepest, Sampling, way_out
+from warp_abtree.kernels.inside.samples import AVOIDED_MAX, KNOWN, Deepest, Sampling, way_out
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.triangle.segment import unit_vector
 
@@ -29,15 +29,15 @@ wp.set_module_options(MODULE_OPTIONS)
 
 # Part of the smaller object's size by which a sample must be deeper than all points of its pair; and under which the
 # points of a pair that has some tell that nothing is deep.
-DEEPER = wp.constant(wp.float64(2.0**-12))
+DEPTH_STEP = wp.constant(wp.float64(2.0**-12))
 # Part of that size by which samples lie apart, and of the first one's depth that others have at least.
-APART, LESS = wp.constant(wp.float64(0.25)), wp.constant(wp.float64(0.5))
+SAMPLE_SPACING, LESS = wp.constant(wp.float64(0.25)), wp.constant(wp.float64(0.5))
 
 
 @wp.func
-def size_of(states: StatePool, whose: Whose):
+def size_of(states: StatePool, solid: Solid):
     """Return the diagonal of a root's box."""
-    root = load_node(states, whose.node + 1)
+    root = load_node(states, solid.node + 1)
     return wp.float64(wp.length(root.upper - root.lower))
 
 
@@ -60,7 +60,7 @@ def way_of_points(manifolds: Manifolds, p: wp.int32):
 
 
 @wp.func
-def way_of_middle(models: ModelPool, states: StatePool, pose: PairPose, inner: Whose, outer: Whose):
+def way_of_middle(models: ModelPool, states: StatePool, pose: PairPose, inner: Solid, outer: Solid):
     """Return the way out of the middle of the inner object's box, in A's frame."""
     root = load_node(states, inner.node + 1)
     middle = HALF * (wp.vec3d(root.lower) + wp.vec3d(root.upper)) + inner.centre
@@ -78,8 +78,8 @@ def way_of_second(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    first: Whose,
-    second: Whose,
+    first: Solid,
+    second: Solid,
     which: wp.int32,
     normals: wp.vec3d,
 ):
@@ -168,19 +168,19 @@ def add_inside_point_kernel(
     if hits.any_hit[p] == 0 or (solids.is_solid[a] == 0 and solids.is_solid[b] == 0):
         return
     pose = pair_poses[p]
-    frame = make_frame(models, states, objects, pose, a, b)
-    first = make_whose(models, states, pose, frame, False, objects.state[a])
-    second = make_whose(models, states, pose, frame, True, objects.state[b])
+    scaling = make_scale(models, states, objects, pose, a, b)
+    first = make_solid(models, states, pose, scaling, False, objects.state[a])
+    second = make_solid(models, states, pose, scaling, True, objects.state[b])
     size = wp.min(size_of(states, first), size_of(states, second))
     deep = known_depth(manifolds_inout, p)
-    if manifolds_inout.count[p] > 0 and deep < DEEPER * size:
+    if manifolds_inout.count[p] > 0 and deep < DEPTH_STEP * size:
         return
-    deep += DEEPER * size
+    deep += DEPTH_STEP * size
     least = wp.float64(deep)
     sampling = Sampling()
     most = manifolds_inout.point.shape[1]
     sampling.samples = 3
-    sampling.radius = APART * size
+    sampling.radius = SAMPLE_SPACING * size
     normals = wp.transpose(objects.rotation[a]) * way_of_points(manifolds_inout, p)
     sampling.way = way_of_second(models, states, pose, first, second, hits.any_hit[p], normals)
     along = order_direction(objects.rotation[a])

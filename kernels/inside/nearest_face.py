@@ -1,6 +1,6 @@
-"""The face of A or B that is nearest to a point in A's frame, by a search of its tree.
+"""Nearest face of A or B to a point in A's frame: branch and bound over its tree.
 
-Distances are those of `distance.triangle_pair` for a face and a point: at most the slack of `Whose` off, whatever the
+Distances are those of `triangle.triangle_pair` for a face and a point: at most the slack of `Solid` off, whatever the
 face. Boxes are compared in their own frame, to which the point is taken by the transpose of the rotation; the margin
 of `PairPose` covers that, a rotation off orthonormal included, along each axis, so twice of it along any line.
 """
@@ -10,8 +10,8 @@ import warp as wp
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool
 from warp_abtree.kernels.base.nodes import Node, load_node
 from warp_abtree.kernels.base.poses import PairPose
-from warp_abtree.kernels.distance.frame import Frame
-from warp_abtree.kernels.inside.parity import STACK_ROOM, face_corners
+from warp_abtree.kernels.distance.frame import SearchScale
+from warp_abtree.kernels.inside.parity import STACK_ROOM, load_posed_face
 from warp_abtree.kernels.triangle.distance import clamp_unit, divide
 from warp_abtree.kernels.triangle.triangle_pair import Features, cross_exactly, offer, offer_corner, scale_triangles
 
@@ -23,8 +23,8 @@ NO_NEAREST = wp.constant(2**31 - 1)
 
 
 @wp.struct
-class Whose:
-    """One object of a pair, as distances of points from it are asked."""
+class Solid:
+    """One object of a pair in queries of points' distances from it."""
 
     of_b: bool  # whether it is B
     node: wp.int32  # where its tree lies in the pool
@@ -35,25 +35,25 @@ class Whose:
 
 
 @wp.func
-def make_whose(models: ModelPool, states: StatePool, pose: PairPose, frame: Frame, of_b: bool, state: wp.int32):
-    """Return A or B of a pair, of a state."""
-    whose = Whose()
-    whose.of_b = of_b
-    whose.node = wp.where(of_b, pose.node_b, pose.node_a)
-    whose.centre = models.centre[states.model[state]]
-    whose.slack = frame.pair_slack
-    whose.margin = wp.float64(2.0) * wp.float64(pose.margin) + frame.pair_slack
-    whose.grow = wp.float64(frame.grow)
-    return whose
+def make_solid(models: ModelPool, states: StatePool, pose: PairPose, scaling: SearchScale, of_b: bool, state: wp.int32):
+    """Return the `Solid` of A or B of a pair."""
+    solid = Solid()
+    solid.of_b = of_b
+    solid.node = wp.where(of_b, pose.node_b, pose.node_a)
+    solid.centre = models.centre[states.model[state]]
+    solid.slack = scaling.pair_slack
+    solid.margin = wp.float64(2.0) * wp.float64(pose.margin) + scaling.pair_slack
+    solid.grow = wp.float64(scaling.grow)
+    return solid
 
 
 @wp.func
-def into_frame(pose: PairPose, whose: Whose, point: wp.vec3d):
-    """Return a point of A's frame in that of an object, about its model's centre."""
+def into_frame(pose: PairPose, solid: Solid, point: wp.vec3d):
+    """Map a point of A's frame to an object's model frame, about the model's centre."""
     x = point
-    if whose.of_b:
+    if solid.of_b:
         x = wp.transpose(pose.rotation) * (point - pose.translation)
-    return x - whose.centre
+    return x - solid.centre
 
 
 @wp.func
@@ -103,9 +103,9 @@ def point_weights(near: Features):
 
 
 @wp.func
-def point_distance(models: ModelPool, states: StatePool, pose: PairPose, whose: Whose, face: wp.int32, point: wp.vec3d):
+def point_distance(models: ModelPool, states: StatePool, pose: PairPose, solid: Solid, face: wp.int32, point: wp.vec3d):
     """Return the distance of a point in A's frame from an active face of an object."""
-    a, b, c = face_corners(models, states, pose, whose.of_b, face)
+    a, b, c = load_posed_face(models, states, pose, solid.of_b, face)
     near, size = point_features(a, b, c, point)
     return wp.sqrt(near.square) * size
 
@@ -115,7 +115,7 @@ def nearest_face(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    whose: Whose,
+    solid: Solid,
     point: wp.vec3d,
     hint: wp.int32,
     enough: wp.float64,
@@ -127,28 +127,28 @@ def nearest_face(
         hint: A face that may be near, or NO_NEAREST.
         enough: The search ends with the first face that is nearer.
     """
-    x = into_frame(pose, whose, point)
+    x = into_frame(pose, solid, point)
     least, face = wp.float64(wp.inf), wp.int32(hint)
     if hint != NO_NEAREST:
-        least = point_distance(models, states, pose, whose, hint, point)
+        least = point_distance(models, states, pose, solid, hint, point)
         if least < enough:
             return least, face
-    limit = (least + whose.margin) * whose.grow
+    limit = (least + solid.margin) * solid.grow
     limit = limit * limit
     stack = wp.zeros(shape=(STACK_ROOM,), dtype=wp.int32)
     bound = wp.zeros(shape=(STACK_ROOM,), dtype=wp.float64)
     stack[0] = 1
-    bound[0] = square_outside(load_node(states, whose.node + 1), x)
+    bound[0] = square_outside(load_node(states, solid.node + 1), x)
     end = wp.int32(1)
     while end > 0:
         end -= 1
         # Infinite where nothing is active.
         live = bound[end] <= limit and bound[end] < wp.float64(wp.inf)
-        node = load_node(states, whose.node + stack[end])
+        node = load_node(states, solid.node + stack[end])
         if live and node.face < 0:
             first = 2 * node.skip
-            d0 = square_outside(load_node(states, whose.node + first), x)
-            d1 = square_outside(load_node(states, whose.node + first + 1), x)
+            d0 = square_outside(load_node(states, solid.node + first), x)
+            d1 = square_outside(load_node(states, solid.node + first + 1), x)
             # The nearer one on top.
             turn = wp.where(d0 < d1, 1, 0)
             stack[end] = first + turn
@@ -157,12 +157,12 @@ def nearest_face(
             bound[end + 1] = wp.min(d0, d1)
             end += 2
         elif live:
-            d = point_distance(models, states, pose, whose, node.face, point)
+            d = point_distance(models, states, pose, solid, node.face, point)
             if d < least or (d == least and node.face < face):
                 face = node.face
                 if d < least:
                     least = d
-                    limit = (d + whose.margin) * whose.grow
+                    limit = (d + solid.margin) * solid.grow
                     limit = limit * limit
                 if d < enough:
                     end = 0

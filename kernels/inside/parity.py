@@ -1,4 +1,4 @@
-"""Whether a point lies inside a closed surface, exactly: the crossings of a ray along an axis of A's frame are odd.
+"""Even-odd ray test, exact: a point is inside a closed surface that a ray from it crosses an odd number of times.
 
 Coordinates are those of the intersection test: A's vertices, and x' of B's (docs/exactness.md). The ray starts at the
 point moved by (e, e^2) across the axis, e positive and smaller than any number, and never meets an edge then: of a
@@ -70,7 +70,7 @@ def crosses_face(ray: Ray, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 @wp.func
 def ray_meets(ray: Ray, sum: wp.vec3, size: wp.vec3):
-    """Return False only where a ray passes a box by: twice its centre, and its width, about the centre of A's model."""
+    """Return False only where a ray misses a box: twice its centre, and its width, about the centre of A's model."""
     met = bool(True)
     for i in range(3):
         x = wp.float64(2.0) * ray.near[i] - wp.float64(sum[i])
@@ -104,7 +104,7 @@ def meets_node(pose: PairPose, of_b: bool, node: Node, ray: Ray):
 
 @wp.func
 def make_ray(pose: PairPose, of_b: bool, states: StatePool, centre: wp.vec3d, point: wp.vec3d):
-    """Return the ray from a point in A's frame along which the way out of a tree's box is shortest."""
+    """Return the axis-aligned ray from a point in A's frame that leaves a tree's box soonest."""
     ray = Ray()
     ray.origin = point
     ray.near = point - centre
@@ -127,7 +127,7 @@ def make_ray(pose: PairPose, of_b: bool, states: StatePool, centre: wp.vec3d, po
 
 
 @wp.func
-def face_corners(models: ModelPool, states: StatePool, pose: PairPose, of_b: bool, face: wp.int32):
+def load_posed_face(models: ModelPool, states: StatePool, pose: PairPose, of_b: bool, face: wp.int32):
     """Return the corners of an active face of A or of B in A's frame."""
     c = states.face_corner[wp.where(of_b, pose.corner_b, pose.corner_a) + face]
     p = load_vertex(models.vertex_pos, c[0])
@@ -159,7 +159,7 @@ def is_inside(models: ModelPool, states: StatePool, pose: PairPose, of_b: bool, 
         end -= 1
         node = load_node(states, start + stack[end])
         if node.face >= 0:
-            a, b, c = face_corners(models, states, pose, of_b, node.face)
+            a, b, c = load_posed_face(models, states, pose, of_b, node.face)
             crossings += crosses_face(ray, a, b, c)
         else:
             for k in range(2):

@@ -1,4 +1,4 @@
-"""Samples of a surface inside a solid: which are looked at, how deep they are, and their ways out.
+"""Depth samples of a surface inside a solid: their places on a face, depths, and directions out.
 
 Samples of a face are its corners, the middles of its edges and its centroid. The depth of a point inside is its
 distance from the surface.
@@ -8,10 +8,10 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool
 from warp_abtree.kernels.base.nodes import load_node
-from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.base.poses import HALF, PairPose
 from warp_abtree.kernels.inside.nearest_face import (
     NO_NEAREST,
-    Whose,
+    Solid,
     into_frame,
     nearest_face,
     point_distance,
@@ -19,7 +19,7 @@ from warp_abtree.kernels.inside.nearest_face import (
     point_weights,
     square_outside,
 )
-from warp_abtree.kernels.inside.parity import face_corners, is_inside
+from warp_abtree.kernels.inside.parity import is_inside, load_posed_face
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -29,7 +29,6 @@ NO_SAMPLE = wp.constant(wp.int64(2**63 - 1))
 # Before all samples: of what is known already, equally deep ones are no better.
 KNOWN = wp.constant(wp.int64(-1))
 AVOIDED_MAX = wp.constant(3)
-HALF = wp.constant(wp.float64(0.5))
 
 
 @wp.struct
@@ -43,7 +42,7 @@ class Deepest:
 
 @wp.struct
 class Sampling:
-    """Which samples are looked at: of each face the first ones, none near to some points, of some ways out."""
+    """Selection of samples: the first ones of each face, not near points to avoid, their ways out along a direction."""
 
     samples: wp.int32  # of each face: 3, its corners, or SAMPLES
     way: wp.vec3d  # B's way out, in A's frame: others make an angle of at most 90 degrees with it; 0 for any
@@ -92,9 +91,9 @@ def sample_weights(sample: wp.int32):
 
 
 @wp.func
-def way_out(models: ModelPool, states: StatePool, pose: PairPose, outer: Whose, face: wp.int32, point: wp.vec3d):
+def way_out(models: ModelPool, states: StatePool, pose: PairPose, outer: Solid, face: wp.int32, point: wp.vec3d):
     """Return the way from a point to the nearest one of a face of an object, in A's frame."""
-    a, b, c = face_corners(models, states, pose, outer.of_b, face)
+    a, b, c = load_posed_face(models, states, pose, outer.of_b, face)
     near, _size = point_features(a, b, c, point)
     w = point_weights(near)
     return w[0] * (a - point) + w[1] * (b - point) + w[2] * (c - point)
@@ -105,16 +104,16 @@ def measure_samples(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    inner: Whose,
-    outer: Whose,
+    inner: Solid,
+    outer: Solid,
     face: wp.int32,
     hint: wp.int32,
     known: Deepest,
     sampling: Sampling,
 ):
-    """Return the deepest of what is known and the samples of a face that are inside the outer object."""
+    """Return the deepest of a known sample and the samples of a face that are inside the outer object."""
     best = known
-    a, b, c = face_corners(models, states, pose, inner.of_b, face)
+    a, b, c = load_posed_face(models, states, pose, inner.of_b, face)
     centre = wp.where(inner.of_b, outer.centre, inner.centre)
     root = load_node(states, outer.node + 1)
     near = wp.int32(hint)

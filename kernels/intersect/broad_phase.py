@@ -6,12 +6,11 @@ from warp_abtree.kernels.base.arrays import LAST_KEY, ModelPool, ObjectPool, Sta
 from warp_abtree.kernels.base.boxes import round_down, round_up
 from warp_abtree.kernels.base.generation import LaunchRecord, is_stale
 from warp_abtree.kernels.base.nodes import load_node
-from warp_abtree.kernels.base.poses import measure_skew
+from warp_abtree.kernels.base.poses import ROUNDING_64, measure_skew
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-# Some ten float64 roundings; this is 32 of them.
-ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
+# Of sums of lengths in float64.
 REACH_ROUNDING = wp.constant(wp.float64(1.0 + 2.0**-48))
 
 

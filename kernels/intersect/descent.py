@@ -1,4 +1,4 @@
-"""How a thread of the CPU descends into an object pair: by boxes of nodes, then by slabs of subtrees where they pay.
+"""Dual-tree descent of a CPU thread: by boxes of nodes, then by slabs of subtrees where they pay.
 
 Slabs are made where few of many tests of boxes have led to hits. Of an object that is the first of several pairs in a
 row they serve all of these, and so pay where hits are more frequent too. What decides is the list of pairs alone, so
@@ -71,7 +71,7 @@ def move_below(
 
 @wp.func_native(native.body("intersect/open_subtrees.h", "slab_cost"))
 def slab_cost(models: ModelPool, states: StatePool, pose: PairPose, repeats: wp.int32) -> wp.int64:
-    """Return about how many node pair tests the slabs of an object pair take, for an A of one pair before it or two."""
+    """Estimate the cost of an object pair's slabs in node pair tests, for an A of one pair before it or two."""
 
 
 @wp.func_native(native.body("intersect/open_subtrees.h", "open_subtrees"))
@@ -82,7 +82,7 @@ def open_subtrees(
     thread: wp.int32,
     memory: wp.array2d(dtype=wp.float32),
 ) -> wp.vec2i:
-    """Choose the directions of slabs for an object pair; return its floors, see `move_below`.
+    """Choose the slab directions of an object pair; return its floors, see `move_below`.
 
     Directions and slabs of A stay for the next pair with it, in this launch or a later one.
     """
@@ -114,7 +114,7 @@ def slab_memory_words(depth: int) -> int:
 
 @wp.struct
 class Descent:
-    """How a thread goes through an object pair, and how far it is."""
+    """State of a thread's descent into an object pair."""
 
     thread: wp.int32  # row of the memory for slabs
     at_once: wp.int32  # items taken from the stack
@@ -139,7 +139,7 @@ def count_repeats(p: wp.int32, pair_poses: wp.array(dtype=PairPose)):
 
 
 @wp.func
-def start_pair(output: wp.int32, plain_tests: wp.int64, repeats: wp.int32, before: Descent):
+def start_descent(output: wp.int32, plain_tests: wp.int64, repeats: wp.int32, before: Descent):
     """Return the descent from the item on the stack."""
     descent = before
     descent.at_once = wp.where(output == OUTPUT_ANY, ITEMS_FOR_ANY, ITEMS_AT_ONCE)
@@ -156,10 +156,10 @@ def start_pair(output: wp.int32, plain_tests: wp.int64, repeats: wp.int32, befor
 
 
 @wp.func
-def wants_slabs(
+def should_build_slabs(
     models: ModelPool, states: StatePool, pose: PairPose, hit_count: wp.int64, tested: wp.int64, before: Descent
 ):
-    """Return whether slabs are to be made, and the descent with the next time to look."""
+    """Return whether to build slabs now, and the descent with the number of tests after which to ask again."""
     descent = before
     if tested >= descent.plain_tests and hit_count * NODE_TESTS_A_HIT <= tested:
         return True, descent
@@ -194,7 +194,7 @@ def advance(
     """
     descent = before
     if descent.top > 0 and tested >= descent.looks:
-        wanted, descent = wants_slabs(models, states, pose, hit_count, tested, descent)
+        wanted, descent = should_build_slabs(models, states, pose, hit_count, tested, descent)
         if wanted:
             descent.floors = open_subtrees(models, states, pose, descent.thread, memory)
             descent.looks = NEVER
@@ -217,8 +217,8 @@ def advance(
 
 
 @wp.func
-def seek_elsewhere(met: wp.int32, number: wp.int64, before: Descent, stack: wp.array(dtype=wp.int64)):
-    """End a search that found a hit; else go on with some other item of the stack, and with more at a time."""
+def shuffle_stack(met: wp.int32, number: wp.int64, before: Descent, stack: wp.array(dtype=wp.int64)):
+    """End a search that found a hit; else swap a pseudo-random item to the top, and take more at a time."""
     descent = before
     if met > 0:
         descent.top = 0

@@ -62,7 +62,7 @@ TESTS_A_TURN = wp.constant(4)
 
 @wp.struct
 class Pace:
-    """How a warp goes about its items."""
+    """Work of a warp in a turn, and turns between its looks for idle warps."""
 
     tests_max: wp.int32  # node pair tests of each lane in a turn
     balance_mask: wp.int32  # turns whose number has none of these bits look for idle warps
@@ -88,7 +88,7 @@ def expand_items(
     states: StatePool,
     pose: PairPose,
 ):
-    """Test items first to first + popped, one a lane, append what they emit; return ends and pairs compared.
+    """Expand items first to first + popped, one a lane, and append what they emit; return ends and pairs compared.
 
     Lanes without an item look at another's, so that none branches.
     """
@@ -122,7 +122,7 @@ def separate_slab_pairs(
 
 @wp.func
 def first_items(items: wp.uint64, slot: wp.int32, task: wp.vec3i, pose: PairPose, work: Work):
-    """Put what lies in a slot on the empty stack, or without one what a unit starts with; return the stack's end."""
+    """Push the items of a slot, or without one those that a unit starts with, on the empty stack; return its end."""
     if slot >= 0:
         return receive_items(items, slot, work)
     return start_items(items, task[1], task[2], pose)
@@ -130,13 +130,13 @@ def first_items(items: wp.uint64, slot: wp.int32, task: wp.vec3i, pose: PairPose
 
 @wp.func
 def slab_floor(pose: PairPose, parts: wp.int32):
-    """Return the nodes of A and B from which on slabs are compared, where so many warps share a pair."""
+    """Return the nodes of A and B from which on slabs are compared, NO_NODE where many warps share a small pair."""
     small = wp.max(pose.floor[0], pose.floor[1]) <= SLAB_NODES * parts
     return wp.where(small, wp.vec2i(NO_NODE, NO_NODE), pose.floor)
 
 
 @wp.func
-def descend(
+def descend_warp(
     items: wp.uint64,
     pace: Pace,
     ready: wp.int32,
@@ -190,7 +190,7 @@ def traverse_items(
     hits: Hits,
     work: Work,
 ):
-    """Traverse what is on the stack and is not given away; return pairs of boxes compared, and face pair tests."""
+    """Traverse the stack, less the items donated; return pairs of boxes compared, and face pair tests."""
     items, for_any = own.items, pace.for_any
     head, ends = wp.int32(0), wp.vec3i(own.end, 0, 0)
     node_tests, turn = wp.int32(0), wp.int32(0)
@@ -207,7 +207,7 @@ def traverse_items(
         if turn == LONG_SEARCH and for_any:
             ready = warp_size()
             floor = pose.floor
-        ends, compared = descend(items, pace, ready, head, ends, floor, models, states, pose)
+        ends, compared = descend_warp(items, pace, ready, head, ends, floor, models, states, pose)
         node_tests += compared
         waiting = ends[2]
         empty = ends[0] == head and ends[1] == 0
@@ -255,7 +255,7 @@ def open_stack():
 
 @wp.func
 def count_tests(hits: Hits, pair: wp.int32, node_tests: wp.int32, tests: wp.vec3i):
-    """Count what the lanes have tested: pairs of boxes, and what `traverse_items` returns of face pairs."""
+    """Count the tests of all lanes: pairs of boxes, and the face pair tests of `traverse_items`."""
     add_warp_sum(hits.node_tests, pair, node_tests)
     add_warp_sum(hits.count, pair, tests[0])
     add_warp_sum(hits.triangle_tests, pair, tests[1])

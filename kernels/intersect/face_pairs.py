@@ -34,7 +34,7 @@ GAP = wp.constant(-2)
 NEAR_BIT = wp.constant(1 << 30)
 PAIR_MASK = wp.constant((1 << 30) - 1)
 # In float32 a gap is no larger, so that its products with lengths are finite; and rounded up.
-GAP_MAX, GAP_ROUNDING_32 = wp.constant(2.0**60), wp.constant(1.0 + 2.0**-20)
+GAP_MAX_32, GAP_ROUNDING_32 = wp.constant(2.0**60), wp.constant(1.0 + 2.0**-20)
 
 
 @wp.struct
@@ -77,7 +77,7 @@ def float32_bounds(mode: wp.int32, pose: PairPose):
 @wp.func
 def scaled_gap(pose: PairPose):
     """Return the distance that boxes are widened by at the scale of float32, not too small."""
-    return wp.min(wp.float32(pose.within * pose.scale) * GAP_ROUNDING_32, GAP_MAX)
+    return wp.min(wp.float32(pose.within * pose.scale) * GAP_ROUNDING_32, GAP_MAX_32)
 
 
 @wp.func
@@ -204,7 +204,7 @@ def report_hit(slot: wp.int32, pair: wp.int32, swapped: wp.int32, face_a: wp.int
 
 @wp.func
 def count_apart(hits: Hits):
-    """Return how many face pairs are listed as apart; a count past 2^31 goes past the sign bit, not around."""
+    """Return how many face pairs are listed as apart, read as uint32: an overflowed counter still tells the demand."""
     count = wp.int64(0)
     if hits.gap.shape[0] > 0:
         count = wp.int64(wp.uint32(hits.apart_total[0]))

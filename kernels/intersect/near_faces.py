@@ -22,7 +22,7 @@ from warp_abtree.kernels.triangle.triangle_pair import triangle_distance
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-ERROR_MAX, GAP_MAX = wp.constant(wp.float32(2.0**20)), wp.constant(wp.float32(2.0**40))
+ERROR_MAX, NEAR_GAP_MAX = wp.constant(wp.float32(2.0**20)), wp.constant(wp.float32(2.0**40))
 
 
 @wp.func_native(native.body("intersect/near_filter.h", "simd_near_filter"))
@@ -91,7 +91,7 @@ def may_be_near(models: ModelPool, states: StatePool, pose: PairPose, face_a: wp
     """Return False only where float32 proves two faces farther apart than `within`, as `simd_near_filter`."""
     scale, gap = wp.float32(pose.scale), wp.float32(pose.within * pose.scale)
     # Beyond these numbers float32 has no squares, or no bounds.
-    if not (pose.error < ERROR_MAX and gap < GAP_MAX):
+    if not (pose.error < ERROR_MAX and gap < NEAR_GAP_MAX):
         return True
     a, b = load_points(models, states, pose, pose.translation32 * scale, scale, face_a, face_b)
     # Differences of corners err by `error` along an axis.
@@ -129,7 +129,7 @@ def find_near_kernel(
     pair_poses: wp.array(dtype=PairPose),
     hits_inout: Hits,
 ):
-    """Report the face pairs that are apart and nearer than the gap, every so many-th a thread; a block is a warp.
+    """Report the face pairs that are apart and nearer than the gap, in a grid-stride loop; a block is a warp.
 
     Float32 drops most; those it leaves wait for float64 until a warp of them does.
     """

@@ -1,4 +1,4 @@
-"""The start of a traversal: the relative pose of each object pair, and its counters at 0."""
+"""Start of a traversal: the relative pose of each object pair, and its counters at 0."""
 
 import functools
 
@@ -132,7 +132,7 @@ def relative_poses(with_distances: bool):
 
 @functools.cache
 def pairs_starter(with_distances: bool):
-    """Return the function by which one thread does what `relative_poses` do, where it is to."""
+    """Return the function by which one thread starts all pairs, as the kernels of `relative_poses` do."""
     start_pose = pose_starter(with_distances)
 
     @wp.func

@@ -20,8 +20,8 @@ from warp_abtree.kernels.intersect.descent import (
     Descent,
     advance,
     count_repeats,
-    seek_elsewhere,
-    start_pair,
+    shuffle_stack,
+    start_descent,
     three_numbers,
 )
 from warp_abtree.kernels.intersect.face_pairs import (
@@ -149,7 +149,7 @@ def resolve_uncertain(
     uncertain: wp.array(dtype=wp.int64),
     met_inout: wp.array(dtype=wp.int64),
 ):
-    """Decide uncertain face pairs, as `resolve_faces`: for EXACT in float64, then what is inexact there.
+    """Decide uncertain face pairs, as `resolve_faces`: for EXACT in float64, then the inexact ones by exact signs.
 
     Not inlined: compiling takes less long, and most calls of its caller have none.
 
@@ -167,7 +167,7 @@ def resolve_uncertain(
 
 @wp.func
 def write_counts(p: wp.int32, hit_count: wp.int64, tests: long_counts, hits: Hits):
-    """Write what an object pair took: boxes, faces, those in float64 and those with exact signs."""
+    """Write the counts of an object pair: tests of boxes, of faces, those in float64 and those with exact signs."""
     hits.count[p] = hit_count
     hits.node_tests[p] = tests[0]
     hits.triangle_tests[p] = tests[1]
@@ -186,7 +186,7 @@ def test_leaf_pairs(
     faces: wp.array(dtype=wp.int64),
     uncertain: wp.array(dtype=wp.int64),
 ):
-    """Test leaf pairs in all stages; return how many met, which stand in front of the list then, and what it took."""
+    """Test leaf pairs in all stages; return how many met, put in front of the list, and the counts of tests."""
     if mode == WITHIN:
         near, decided = resolve_faces(mode, output, models, states, pose, 0, waiting, faces, faces)
         return near, long_counts(wp.int64(0), wp.int64(decided), wp.int64(0), wp.int64(0))
@@ -258,7 +258,7 @@ def thread_traversal(mode: int):
             stack[0] = first_item(states, pose)
             slabs = descent.thread < memory_inout.shape[0] and wp.static(mode != int(WITHIN)) and pose.error < wp.inf
             plain = wp.where(slabs, wp.int64(plain_tests), NEVER)
-            descent = start_pair(output, plain, count_repeats(p, pair_poses), descent)
+            descent = start_descent(output, plain, count_repeats(p, pair_poses), descent)
             hit_count, near_count, tests = wp.int64(0), wp.int64(0), long_counts()
             while descent.top > 0 or descent.deep > 0:
                 descent, waiting, compared = advance(
@@ -278,7 +278,7 @@ def thread_traversal(mode: int):
                     hit_count += wp.int64(met)
                     report_hits(output, p, pose.swapped, met, faces, hits_inout)
                 if output == OUTPUT_ANY:
-                    descent = seek_elsewhere(met, tests[0], descent, stack)
+                    descent = shuffle_stack(met, tests[0], descent, stack)
             write_counts(p, hit_count + near_count, tests, hits_inout)
             p = take_unit(work_inout.counter)
 

@@ -73,7 +73,7 @@ def compare_boxes(
 
 @wp.func_native(native.body("intersect/small_trees.cuh", "reserve_run"))
 def reserve_run(total: wp.array(dtype=wp.int32), count: wp.int32) -> wp.int32:
-    """Count so many into total[0], the same number in all lanes; return what it was."""
+    """Add the same number of all lanes to total[0]; return its value before."""
 
 
 @wp.func_native(native.body("intersect/small_trees.cuh", "read_quarter"))
@@ -246,7 +246,7 @@ def test_faces_in_place(items: wp.uint64, error: wp.float32, pair: wp.int32, liv
 
 
 @wp.func
-def report_hits(items: wp.uint64, first: wp.int32, count: wp.int32, pair: wp.int32, swapped: wp.int32, hits: Hits):
+def report_tile_hits(items: wp.uint64, first: wp.int32, count: wp.int32, pair: wp.int32, swapped: wp.int32, hits: Hits):
     """Report so many of the hits that wait, one a lane."""
     warp_sync()
     slot = reserve_run(hits.total, count) + warp_lane()
@@ -314,5 +314,5 @@ def test_overlaps(
         if hit_end >= warp_size() or (hit_end > 0 and added == 0 and waiting == 0):
             reported = wp.min(hit_end, warp_size())
             hit_end -= reported
-            report_hits(items, hit_end, reported, pair, pose.swapped, hits)
+            report_tile_hits(items, hit_end, reported, pair, pose.swapped, hits)
     return wp.vec3i(met, tested, uncertain)

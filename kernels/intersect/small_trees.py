@@ -70,7 +70,7 @@ def append_nodes(items: wp.uint64, ends: wp.vec3i, live: bool, of_b: bool, node:
 
 @wp.func
 def level_size(faces: wp.int32):
-    """Return how many nodes the level has that leaves are gathered from: so deep that all of its nodes are there."""
+    """Return the number of nodes of the level to gather leaves from: complete, of at most GATHER_NODES."""
     size = wp.int32(GATHER_NODES)
     while size > 1 and size > faces:
         size /= 2
@@ -79,7 +79,7 @@ def level_size(faces: wp.int32):
 
 @wp.func
 def gather_level(items: wp.uint64, states: StatePool, pose: PairPose):
-    """List what is below the nodes of a level of both trees; return the ends of the lists."""
+    """List the children of the nodes of a level of both trees; return the ends of the lists."""
     size_a, size_b = level_size(pose.faces_a), level_size(pose.faces_b)
     ends = wp.vec3i(0, 0, 0)
     at = warp_lane()
@@ -124,7 +124,7 @@ def gather_leaves(task: wp.vec3i, items: wp.uint64, states: StatePool, pose: Pai
 
 @wp.func
 def count_small(pair: wp.int32, compared: wp.int32, tests: wp.vec3i, hits: Hits):
-    """Count pairs of boxes compared, and what `test_overlaps` returns of face pairs. For one lane."""
+    """Count pairs of boxes compared, and the face pair tests of `test_overlaps`. For one lane."""
     if compared > 0:
         wp.atomic_add(hits.node_tests, pair, wp.int64(compared))
     if tests[1] > 0:

@@ -15,7 +15,12 @@ from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, OUTPUT_FACES, H
 from warp_abtree.kernels.search.warp_stack import push_signed_pair, read_signed_pair, signed_pairs
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair
 from warp_abtree.kernels.triangle.float32_filter import SEPARATED, rotate_corners
-from warp_abtree.kernels.triangle.float64_filter import SHARED_CORNER, UNDECIDED, filter_planes, filter_straddling
+from warp_abtree.kernels.triangle.float64_filter import (
+    PLANES_UNDECIDED,
+    SHARED_CORNER,
+    filter_planes,
+    filter_straddling,
+)
 
 RESOLVE_THREADS = RESOLVE_WARPS * WARP_SIZE  # of a block
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False, "block_dim": RESOLVE_THREADS}
@@ -92,7 +97,7 @@ def resolve_rounded_kernel(
     pair_poses: wp.array(dtype=PairPose),
     hits_inout: Hits,
 ):
-    """Decide the uncertain face pairs of FLOAT32 by rounded determinants: every so many-th a thread."""
+    """Decide the uncertain face pairs of FLOAT32 by rounded determinants, in a grid-stride loop."""
     lane = resolve_lane()
     end = wp.min(hits_inout.uncertain_total[0], hits_inout.uncertain.shape[0])
     at_once = items_at_once(end, threads)
@@ -108,7 +113,7 @@ def resolve_rounded_kernel(
 
 @wp.func
 def item_plane_signs(models: ModelPool, states: StatePool, pose: PairPose, item: wp.vec3i):
-    """Return what `filter_planes` says of a face pair."""
+    """Return the signs of `filter_planes` for a face pair."""
     a = load_corner_ids(states, pose.corner_a + item[1])
     b = load_corner_ids(states, pose.corner_b + item[2])
     a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
@@ -166,7 +171,7 @@ def float64_filter_kernel(
     pair_poses: wp.array(dtype=PairPose),
     hits_inout: Hits,
 ):
-    """Decide the uncertain face pairs, every so many-th a thread, and list those that are inexact in float64.
+    """Decide the uncertain face pairs, in a grid-stride loop, and list those that are inexact in float64.
 
     Planes first: they separate most pairs, and only straddling pairs take edges, when a warp of them waits.
     """
@@ -185,7 +190,7 @@ def float64_filter_kernel(
                 signs = item_plane_signs(models, states, pair_poses[item[0]], item)
             list_apart_item(item, waits and signs == SEPARATED, hits_inout)
             straddling = push_signed_pair(list, straddling, signs >= 0, item, signs)
-            defer_inexact(hits_inout, signs == UNDECIDED, item)
+            defer_inexact(hits_inout, signs == PLANES_UNDECIDED, item)
             warp_sync()
             first += wp.min(at_once * (threads / warp_size()), end - first)
         if straddling >= warp_size() or (first >= end and straddling > 0):
@@ -203,7 +208,7 @@ def resolve_inexact_kernel(
     pair_poses: wp.array(dtype=PairPose),
     hits_inout: Hits,
 ):
-    """Decide the inexact face pairs by exact signs: every so many-th a thread."""
+    """Decide the inexact face pairs by exact signs, in a grid-stride loop."""
     lane = resolve_lane()
     end = hits_inout.inexact_total[0]
     at_once = items_at_once(end, threads)

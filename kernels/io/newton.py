@@ -1,4 +1,4 @@
-"""Between the poses of Newton's bodies and those of objects, and from contact points to `newton.Contacts`."""
+"""Poses of objects from those of Newton's bodies, and `newton.Contacts` from contact points."""
 
 import warp as wp
 
@@ -70,7 +70,7 @@ def pose_shape(
     shape_transform: wp.array(dtype=wp.transform),
     shape: wp.int32,
 ):
-    """Return where a shape stands in the world."""
+    """Return the pose of a shape in the world."""
     if shape_body[shape] < 0:
         return shape_transform[shape]
     return body_q[shape_body[shape]] * shape_transform[shape]

@@ -1,4 +1,4 @@
-"""The ends of a frame that stays on the device: poses in, demands out."""
+"""Input and output of a frame that stays on the device: poses in, demands out."""
 
 import warp as wp
 

@@ -84,7 +84,7 @@ def read_turn(poses: wp.array2d(dtype=Any), i: wp.int32):
 
 
 def pose_readers(width: int):
-    """Return what checks a pose and what reads its position and rotation.
+    """Return the functions that check a pose, and read its position and rotation.
 
     Rows of 7 numbers are x y z qx qy qz qw of a unit quaternion; rows of 16 a rigid 4x4 matrix, taken as it is.
     """

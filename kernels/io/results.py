@@ -1,4 +1,4 @@
-"""What a launch found of each object pair, in one block of memory that one transfer brings over.
+"""Results of each object pair, packed into one block of memory that one transfer brings over.
 
 The block of n pairs, in words of 8 bytes:
 

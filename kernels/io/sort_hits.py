@@ -28,7 +28,7 @@ def make_key_kernel(
     order_inout: wp.array(dtype=wp.int32),
     key_out: wp.array(dtype=wp.int64),
 ):
-    """Make the key of one place a thread, from the fields that a pass of the sort looks at, the last one lowest.
+    """Make the radix key of one place a thread, of the fields that a pass of the sort looks at, the last one lowest.
 
     Args:
         room: Object pairs that there is room for; in place of the pair, it marks places without a hit.
@@ -63,8 +63,7 @@ def place_row_kernel(
     start_out: wp.array(dtype=wp.int32),
     listed_totals_out: wp.array(dtype=wp.int32),
 ):
-    """Put one hit a thread in its place; find where the hits of one object pair a thread start, after the last pair
-    where they end, and defer none yet.
+    """Put one hit a thread in its place, find where the hits of each object pair start, and defer none yet.
 
     Args:
         capacity: Places that were sorted.

@@ -61,7 +61,7 @@ def start_segment_kernel(
     start_out: wp.array(dtype=wp.int32),
     listed_totals_out: wp.array(dtype=wp.int32),
 ):
-    """Sum how many hits there are before each pair, and defer none yet.
+    """Prefix sum of the numbers of hits of the pairs; defers none yet.
 
     Args:
         lanes: SEGMENT_THREADS, 1 on the CPU.

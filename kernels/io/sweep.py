@@ -11,16 +11,14 @@ from warp_abtree.kernels.io.place_poses import pose_readers
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
-NONE_REFUSED = wp.constant(2**31 - 1)
-
 # report: what a chunk tells the host
 REFUSED = wp.constant(0)  # first pose that is none, NONE_REFUSED if all are
-UNCERTAIN = wp.constant(1)  # face pairs that float32 leaves to the later stages
+UNCERTAIN_COUNT = wp.constant(1)  # face pairs that float32 leaves to the later stages
 
 
 @wp.func
 def refuse_pose(objects: ObjectPool, report: wp.array(dtype=wp.int32), i: wp.int32):
-    """Note that row i is no pose, and place its object where it meets nothing."""
+    """Note the index i of a bad pose, and place its object at NaN, where it meets nothing."""
     far = wp.float64(wp.nan)
     objects.position[i + 1] = wp.vec3d(far, far, far)
     objects.rotation[i + 1] = wp.identity(n=3, dtype=wp.float64)
@@ -55,9 +53,9 @@ def report_chunk_kernel(
     report_inout: wp.array(dtype=wp.int32),
     any_out: wp.array(dtype=wp.uint8),
 ):
-    """Pack yes and no into bytes, where there is room for them, and report how many face pairs waited."""
+    """Pack yes and no into bytes, where there is room for them, and report the number of uncertain face pairs."""
     i = wp.tid()
     if i == 0:
-        report_inout[UNCERTAIN] = hits.uncertain_total[0]
+        report_inout[UNCERTAIN_COUNT] = hits.uncertain_total[0]
     if i < any_out.shape[0]:
         any_out[i] = wp.uint8(wp.where(hits.any_hit[i] != 0, 1, 0))

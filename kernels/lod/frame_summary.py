@@ -1,4 +1,4 @@
-"""What a frame did, in one array that one transfer brings over, and the tests of every object."""
+"""Summary of a frame, in one array that one transfer brings over, and the tests of every object."""
 
 import warp as wp
 
@@ -7,7 +7,7 @@ from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-FRAMES, LAUNCHED, PAIRS, HITS, UNCERTAIN, APART, INTERSECTING, NODE_TESTS, TRIANGLE_TESTS = range(9)
+FRAMES, LAUNCHED, PAIRS, HITS, UNCERTAIN_PAIRS, APART, INTERSECTING, NODE_TESTS, TRIANGLE_TESTS = range(9)
 REFITTED, CHANGED, TURNED = 9, 10, 11
 """Words of a summary: frames so far, what became of the query's launch (`LaunchRecord`), object pairs, face pairs that
 intersect, that are uncertain, and that may be within a gap, pairs that intersect, pairs of boxes and of faces tested,
@@ -35,7 +35,7 @@ def summarise_frame_kernel(
     tests_out: wp.array(dtype=wp.int64),
     summary_out: wp.array(dtype=wp.int64),
 ):
-    """Sum what all object pairs took, one a thread; warps are whole.
+    """Sum the counts of all object pairs, a pair a thread; warps are whole.
 
     Args:
         marked_count: Nodes refitted of each tree state, shape [state]; [0] where none is updated.
@@ -64,7 +64,7 @@ def summarise_frame_kernel(
     if i < marked_count.shape[0]:
         refitted = wp.int64(marked_count[i])
     add_lanes(summary_out, wp.static(HITS), hit_count)
-    add_lanes(summary_out, wp.static(UNCERTAIN), uncertain)
+    add_lanes(summary_out, wp.static(UNCERTAIN_PAIRS), uncertain)
     add_lanes(summary_out, wp.static(INTERSECTING), met)
     add_lanes(summary_out, wp.static(NODE_TESTS), node_tests)
     add_lanes(summary_out, wp.static(TRIANGLE_TESTS), triangle_tests)

@@ -35,7 +35,7 @@ RATE_DOWN = wp.constant(4)
 
 @wp.struct
 class Prediction:
-    """What each candidate would cost."""
+    """Predicted costs of each candidate."""
 
     change: wp.array(dtype=wp.int32)  # [candidate] change of the position
     rate: wp.array(dtype=wp.float64)  # [5] see the RATE constants
@@ -82,7 +82,7 @@ def begin_prediction_kernel(
 
 @wp.func
 def predict_nodes(entries: wp.int32, faces: wp.int32, full_share: wp.float64):
-    """Return about how many nodes an LOD change refits, by equation 1, from the entries of its slice.
+    """Estimate the number of nodes that an LOD change refits, by equation 1, from the entries of its slice.
 
     A slice lists each face about twice.
     """

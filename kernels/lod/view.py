@@ -7,7 +7,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.struct
 class ViewArrays:
-    """Camera, and what it measures of each object."""
+    """Camera, and the view of each object."""
 
     # static
     window: wp.int32  # frames of which `motion` is the sum

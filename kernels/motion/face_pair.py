@@ -1,4 +1,4 @@
-"""When two faces first touch: safe steps along the direction in which they are nearest, then a proof that they meet.
+"""Conservative advancement of two faces along the direction in which they are nearest, and proof that they meet.
 
 The faces of the base (`path.Motion.base`) rest, those of the mover move, and gaps are compared along n, fixed in the
 base's frame. ANY n proves what `path` says; the best joins the nearest points. A pair ends
@@ -41,22 +41,22 @@ CLEAR, TOUCHES, UNDECIDED = wp.constant(0), wp.constant(1), wp.constant(2)
 # Of faces whose corners move straight: to be gone on with in double words.
 STALLED = wp.constant(3)
 # Not ended: apart until a time, and to be gone on with.
-GOES_ON = wp.constant(4)
+IN_PROGRESS = wp.constant(4)
 # How far a pair of faces is advanced: by a step along normals if they do, by a step, or to its end.
 NORMALS, ONE_STEP, TO_THE_END = wp.constant(0), wp.constant(1), wp.constant(2)
 
 
 @wp.struct
-class Contact:
-    """How a pair of faces ended, and when."""
+class FirstContact:
+    """Outcome of a face pair's advancement, and its time."""
 
-    end: wp.int32  # CLEAR, TOUCHES or UNDECIDED; GOES_ON
+    end: wp.int32  # CLEAR, TOUCHES or UNDECIDED; IN_PROGRESS
     time: wp.float64  # up to which they are proved apart
 
 
 @wp.struct
-class Progress:
-    """How far a pair of faces has come."""
+class PairProgress:
+    """Progress of a face pair's advancement."""
 
     time: wp.float64  # up to which they are proved apart
     steps: wp.int32  # made
@@ -64,7 +64,7 @@ class Progress:
 
 
 @wp.func
-def load_corners(models: ModelPool, states: StatePool, at: wp.int32) -> corners_type:
+def load_face(models: ModelPool, states: StatePool, at: wp.int32) -> corners_type:
     c = states.face_corner[at]
     return wp.matrix_from_rows(
         load_vertex(models.vertex_pos, c[0]),
@@ -75,7 +75,7 @@ def load_corners(models: ModelPool, states: StatePool, at: wp.int32) -> corners_
 
 @wp.func
 def mover_moment(motion: Motion, t: wp.float64):
-    """Return where the mover is in the base's frame."""
+    """Return the mover's `Moment` in the base's frame."""
     m = place_motion(motion, t)
     if motion.base != 0:
         m = reverse_moment(m)
@@ -96,7 +96,7 @@ def edge_of(m: corners_type, k: wp.int32):
 
 @wp.func
 def level(v: wp.vec3d, e: wp.vec3d):
-    """Return v without what it has along e."""
+    """Return the component of v across e."""
     square = wp.dot(e, e)
     return v - wp.where(square > wp.float64(0.0), wp.dot(v, e) / square, wp.float64(0.0)) * e
 
@@ -141,7 +141,7 @@ def separating_direction(base: corners_type, at: corners_type):
 
 @wp.func
 def axis_of(base: corners_type, at: corners_type, k: wp.int32):
-    """Return the k-th unit vector of the separating axis theorem.
+    """Return the k-th axis of the separating axis theorem (SAT) for two faces, unit.
 
     Cross products of two edges; then for either face what is level and square to an edge, and the normal.
     """
@@ -162,7 +162,7 @@ def axis_of(base: corners_type, at: corners_type, k: wp.int32):
 
 @wp.func
 def step_along(gap: wp.float64, rate: wp.float64, bend: wp.float64):
-    """Return how long a gap stays open for certain, as `node_pair.step_of`; infinite where it does for ever."""
+    """Return a time for which a gap certainly stays open, as `node_pair.step_of`; infinite where it never closes."""
     zero, two = wp.float64(0.0), wp.float64(2.0)
     if gap <= zero or not (gap > zero):
         return zero
@@ -174,7 +174,7 @@ def step_along(gap: wp.float64, rate: wp.float64, bend: wp.float64):
 
 @wp.func
 def time_after(t: wp.float64, step: wp.float64):
-    """Return the time that a step leads to, rounded down."""
+    """Return the time at the end of a step, rounded down."""
     return (t + step) * TIME_DOWN
 
 
@@ -191,7 +191,7 @@ def bend_of_face(motion: Motion, mover: corners_type):
 def safe_step(
     motion: Motion, n: wp.vec3d, base: corners_type, at: corners_type, velocity: corners_type, bend: wp.float64
 ):
-    """Return how long faces stay apart for certain along a unit vector n, from the base's to the mover's.
+    """Return a time for which faces certainly stay apart along a unit vector n, from the base's to the mover's.
 
     Args:
         at: The mover's corners in the base's frame.
@@ -207,10 +207,10 @@ def safe_step(
 
 
 @wp.func
-def longest_step(
+def longest_face_step(
     motion: Motion, tried: wp.float64, base: corners_type, at: corners_type, velocity: corners_type, bend: wp.float64
 ):
-    """Return the longest step along any axis, and the one tried before.
+    """Return the longest safe step along the axes of the separating axis theorem, and the one tried before.
 
     What joins points that are very near errs in its direction, so that long edges seem to reach across it.
     """
@@ -236,7 +236,7 @@ def plane_step(motion: Motion, base: corners_type, at: corners_type, velocity: c
 
 @wp.func
 def meet_at(motion: Motion, t: wp.float64, base: corners_type, mover: corners_type):
-    """Return whether faces intersect at a time, as float64 is certain of the coordinates that it computes."""
+    """Return whether faces certainly intersect at a time, by the coordinates that float64 computes."""
     m = mover_moment(motion, t)
     at = map_corners(m.rotation, m.shift, mover)
     return float64_filter_triangles(base[0], base[1], base[2], at[0], at[1], at[2]) == 1
@@ -253,14 +253,14 @@ def advance_once(
     best: wp.float64,
     normals: bool,
 ):
-    """Return what a step from t on leaves of two faces that are apart until then; GOES_ON from the time it leads to.
+    """Advance two faces that are apart until t by one safe step; IN_PROGRESS from the time that it reaches.
 
-    With normals alone it may lead nowhere, where it is cheap: GOES_ON from t.
+    With normals alone it may reach no later time, where it is cheap: IN_PROGRESS from t.
     """
     m = mover_moment(motion, t)
     at = map_corners(m.rotation, m.shift, mover)
     velocity = map_corners(m.spin, m.speed, mover)
-    contact = Contact()
+    contact = FirstContact()
     step = plane_step(motion, base, at, velocity, bend)
     # A pair may end here for the best time so far, if it would go on after it whatever that is.
     if step >= tolerance and time_after(t, step) > best:
@@ -268,14 +268,14 @@ def advance_once(
         return contact
     contact.time = t
     if step < LONG_STEP:
-        contact.end = GOES_ON
+        contact.end = IN_PROGRESS
         if normals:
             return contact
         n = separating_direction(base, at)
         step = wp.max(step, safe_step(motion, n, base, at, velocity, bend))
     then = time_after(t, step)
     if then <= t:
-        step = longest_step(motion, step, base, at, velocity, bend)
+        step = longest_face_step(motion, step, base, at, velocity, bend)
         then = time_after(t, step)
     contact.end = TOUCHES
     if then <= t:
@@ -284,7 +284,7 @@ def advance_once(
         if meet_at(motion, wp.min(t + tolerance, wp.float64(1.0)), base, mover):
             return contact
     contact.time = then
-    contact.end = wp.where(then > best, CLEAR, GOES_ON)
+    contact.end = wp.where(then > best, CLEAR, IN_PROGRESS)
     return contact
 
 
@@ -296,24 +296,24 @@ def advance_pair(
     pose: PairPose,
     motion: Motion,
     faces: wp.vec2i,
-    before: Progress,
+    before: PairProgress,
     best: wp.float64,
 ):
-    """Return how a face of A and one of B that are apart until a time end, and what was done.
+    """Advance a face of A and one of B that are apart until a time; return the outcome, and the progress.
 
     They go on where `before` says that a step is enough.
     """
-    a = load_corners(models, states, pose.corner_a + faces[0])
-    b = load_corners(models, states, pose.corner_b + faces[1])
+    a = load_face(models, states, pose.corner_a + faces[0])
+    b = load_face(models, states, pose.corner_b + faces[1])
     base, mover = wp.where(motion.base == 0, a, b), wp.where(motion.base == 0, b, a)
     bend = bend_of_face(motion, mover)
-    contact = Contact()
+    contact = FirstContact()
     t, steps = wp.float64(0.0) + before.time, wp.int32(0) + before.steps
     going = bool(True)
     while going:
         contact = advance_once(tolerance, motion, base, mover, bend, t, best, before.mode == NORMALS)
-        going = contact.end == GOES_ON and before.mode == TO_THE_END
-        if contact.end == GOES_ON:
+        going = contact.end == IN_PROGRESS and before.mode == TO_THE_END
+        if contact.end == IN_PROGRESS:
             # Normals alone may lead nowhere, which is no step.
             steps += wp.where(contact.time > t, 1, 0)
             if steps == STEPS_MAX:

@@ -1,4 +1,4 @@
-"""The search for first contacts by warps: node and face pairs of a few object pairs at once fill the lanes.
+"""Branch and bound for first contacts by warps: node and face pairs of a few object pairs at once fill the lanes.
 
 As `search`, whose answers it has. A face pair is advanced by normals first, which decide most; what is left goes on
 step by step, each with 31 others, since a step takes as long as its slowest lane, and the others are ten times as long.
@@ -18,17 +18,17 @@ from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import (
     CLEAR,
-    GOES_ON,
+    IN_PROGRESS,
     NORMALS,
     ONE_STEP,
     TOUCHES,
     UNDECIDED,
-    Contact,
-    Progress,
+    FirstContact,
+    PairProgress,
 )
 from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
 from warp_abtree.kernels.motion.linear import EndPoses
-from warp_abtree.kernels.motion.start import OPEN, Contacts
+from warp_abtree.kernels.motion.start import OPEN, FirstContacts
 from warp_abtree.kernels.search.item import FACES, NODES, first_item, four_items, item_first, item_second
 from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item
@@ -42,40 +42,40 @@ GROUPED_LEAST = wp.constant(8192)
 MOTION_STACK_LENGTH = native.constant("MOTION_STACK_LENGTH")
 GOING_START, TIMES_START = native.constant("MOTION_GOING_START"), native.constant("MOTION_TIMES_START")
 
-stack_code = partial(native.body, "search/motion_stack.cuh")
+motion_stack_code = partial(native.body, "search/motion_stack.cuh")
 
 
-@wp.func_native(stack_code("motion_stack"))
+@wp.func_native(motion_stack_code("motion_stack"))
 def motion_stack() -> wp.uint64:
-    """Return where this warp's lists lie, an address in shared memory on CUDA."""
+    """Return the address of this warp's lists, in shared memory on CUDA."""
 
 
-@wp.func_native(stack_code("read_tag"))
+@wp.func_native(motion_stack_code("read_tag"))
 def read_tag(items: wp.uint64, i: wp.int32) -> wp.float32:
-    """Return until when the i-th pair is apart, or of a face pair that goes on how many steps were made."""
+    """Return the time until which the i-th pair is apart, or the number of steps of a face pair in progress."""
 
 
-@wp.func_native(stack_code("read_slot"))
+@wp.func_native(motion_stack_code("read_slot"))
 def read_slot(items: wp.uint64, i: wp.int32) -> wp.int32: ...
 
 
-@wp.func_native(stack_code("write_entry"))
+@wp.func_native(motion_stack_code("write_entry"))
 def write_entry(items: wp.uint64, i: wp.int32, item: wp.int64, tag: wp.float32, slot: wp.int32): ...
 
 
-@wp.func_native(stack_code("write_time"))
+@wp.func_native(motion_stack_code("write_time"))
 def write_time(items: wp.uint64, i: wp.int32, time: wp.float64):
     """Write the time of the i-th face pair that goes on."""
 
 
-@wp.func_native(stack_code("place_in"))
+@wp.func_native(motion_stack_code("place_in"))
 def place_in(end: wp.int32, flag: bool) -> wp.int32:
-    """Return where this lane's entry goes in a list that ends there, of the lanes whose flag is set."""
+    """Return the place of this lane's entry in a list that ends there, of the lanes whose flag is set."""
 
 
-@wp.func_native(stack_code("end_after"))
+@wp.func_native(motion_stack_code("end_after"))
 def end_after(end: wp.int32, flag: bool) -> wp.int32:
-    """Return where such a list ends then."""
+    """Return the end of such a list after that."""
 
 
 @wp.struct
@@ -140,10 +140,10 @@ def push_steps(
 
 
 @wp.func
-def take_contacts(group: Group, slot: wp.int32, own: Contact):
+def take_contacts(group: Group, slot: wp.int32, own: FirstContact):
     """Return a group with the earliest of the contacts of all lanes."""
     found = group
-    time = wp.where(own.end == CLEAR or own.end == GOES_ON, wp.float64(wp.inf), own.time)
+    time = wp.where(own.end == CLEAR or own.end == IN_PROGRESS, wp.float64(wp.inf), own.time)
     for k in range(4):
         mine = slot == k
         earliest = warp_min(wp.where(mine, time, wp.float64(wp.inf)))
@@ -156,7 +156,7 @@ def take_contacts(group: Group, slot: wp.int32, own: Contact):
 
 
 @wp.func
-def meet_faces(
+def advance_face_pairs(
     items: wp.uint64,
     ends: wp.vec3i,
     mode: wp.int32,
@@ -168,7 +168,7 @@ def meet_faces(
     motion: Any,
     before: Group,
 ):
-    """Advance face pairs, one a lane; return what is found and the lists' ends.
+    """Advance face pairs, one a lane; return the group with their contacts, and the lists' ends.
 
     Args:
         mode: ONE_STEP for those that go on, NORMALS for those that wait.
@@ -177,7 +177,7 @@ def meet_faces(
     waiting, going = ends[1], ends[2]
     popped = wp.min(wp.where(mode == ONE_STEP, going, waiting), warp_size())
     lane = wp.min(warp_lane(), popped - 1)
-    progress = Progress()
+    progress = PairProgress()
     progress.mode = mode
     at = wp.int32(0)
     if mode == ONE_STEP:
@@ -193,14 +193,14 @@ def meet_faces(
     best = time_of(group, slot)
     live = warp_lane() < popped and progress.time <= best
     warp_sync()
-    own, steps = Contact(), wp.int32(0)
+    own, steps = FirstContact(), wp.int32(0)
     if live:
         p = group.first + slot
         faces = wp.vec2i(item_first(item), item_second(item))
         own, steps = advance_faces(tolerance, models, states, poses, pair_poses[p], motion[p], faces, progress, best)
     group.faces = count_in(group.faces, slot, wp.where(live and mode != ONE_STEP, 1, 0))
     group = take_contacts(group, slot, own)
-    goes_on = own.end == GOES_ON and own.time <= time_of(group, slot)
+    goes_on = own.end == IN_PROGRESS and own.time <= time_of(group, slot)
     place = place_in(going, goes_on)
     if goes_on:
         write_entry(items, GOING_START + place, item, wp.float32(steps), slot)
@@ -218,7 +218,7 @@ def start_group(
     count: wp.int32,
     states: StatePool,
     pair_poses: wp.array(dtype=PairPose),
-    contacts: Contacts,
+    contacts: FirstContacts,
 ):
     """Put the roots of the object pairs that are open on the empty stack; return their group, and how many."""
     group = Group()
@@ -273,7 +273,9 @@ def search_group(
         mode = wp.where(ends[2] >= warp_size() or ends[1] == 0, ONE_STEP, NORMALS)
         most = wp.where(mode == ONE_STEP, ends[2], ends[1])
         if most >= warp_size() or (ends[0] == 0 and most > 0):
-            group, ends = meet_faces(items, ends, mode, tolerance, models, states, poses, pair_poses, motion, group)
+            group, ends = advance_face_pairs(
+                items, ends, mode, tolerance, models, states, poses, pair_poses, motion, group
+            )
     return group
 
 
@@ -296,7 +298,7 @@ def warp_search(kind):
         motion: wp.array(dtype=kind),
         # out
         hits_inout: Hits,
-        contacts_inout: Contacts,
+        contacts_inout: FirstContacts,
     ):
         """Search the object pairs that are open, a few a warp."""
         count = pair_count[0]

@@ -1,10 +1,10 @@
-"""The steps of the search for either kind of motion, by the type of the motion that they are given."""
+"""Steps of the search for first contacts by the type of motion: rigid or linear."""
 
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.base.poses import PairPose
-from warp_abtree.kernels.motion.face_pair import Progress, advance_pair
+from warp_abtree.kernels.motion.face_pair import PairProgress, advance_pair
 from warp_abtree.kernels.motion.linear import (
     EndPoses,
     LinearMotion,
@@ -71,7 +71,7 @@ def advance_nodes(
     item: wp.int64,
     live: wp.int32,
 ):
-    """Compare what an item names from t on, see `node_pair.advance_children`."""
+    """Expand an item from time t on, see `node_pair.advance_children`."""
     boxes = box_motion(motion, place_motion(motion, wp.float64(t)))
     items, kinds, times, tests = advance_children(states, pose, motion, boxes, t, best, item, live)
     return items, kinds, times, tests
@@ -100,10 +100,10 @@ def advance_faces(
     pose: PairPose,
     motion: Motion,
     faces: wp.vec2i,
-    before: Progress,
+    before: PairProgress,
     best: wp.float64,
 ):
-    """Return the `Contact` of a face of A and one of B, and the steps made so far."""
+    """Return the `FirstContact` of a face of A and one of B, and the steps made so far."""
     contact, steps = advance_pair(tolerance, models, states, pose, motion, faces, before, best)
     return contact, steps
 
@@ -117,7 +117,7 @@ def advance_faces(  # noqa: F811
     pose: PairPose,
     motion: LinearMotion,
     faces: wp.vec2i,
-    before: Progress,
+    before: PairProgress,
     best: wp.float64,
 ):
     contact = advance_linear_pair(tolerance, models, states, poses, pose, motion, faces[0], faces[1], before.time, best)

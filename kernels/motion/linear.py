@@ -1,7 +1,7 @@
 """Motions whose vertices move straight, from a posed mesh to the same mesh posed elsewhere: nothing bends.
 
 In A's first frame A's point a lies at a + t (way_a a + shift_a), and B's point b at R0 b + x0 + t (way_b b + shift_b):
-affine in both, so an image of a box at a time, and one of the speeds of its points, are boxes as in `traversal.boxes`.
+affine in both, so an image of a box at a time, and one of the speeds of its points, are boxes as in `base.boxes`.
 They are compared along the axes of A's first frame and the columns of R0, which rest. A gap g between corners that
 grows at a rate s stays open until g + s h = 0; of faces it is taken for each of nine pairs of corners. Roundings as in
 `path`; in float32 both boxes have an image now, each as wide as the margin there says.
@@ -12,26 +12,26 @@ import warp as wp
 from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.base.boxes import pose_box
 from warp_abtree.kernels.base.nodes import Node, load_constant_node, load_node
-from warp_abtree.kernels.base.poses import ROUNDING_32, PairPose, reach_box
+from warp_abtree.kernels.base.poses import ROUNDING_32, SCALE_MAX, PairPose, reach_box
 from warp_abtree.kernels.motion.face_pair import (
     AXIS_COUNT,
     CLEAR,
     STALLED,
     STEPS_MAX,
     TOUCHES,
-    Contact,
+    FirstContact,
     axis_of,
-    load_corners,
+    load_face,
     map_corners,
     separating_direction,
     step_along,
     time_after,
 )
 from warp_abtree.kernels.motion.node_pair import go_on, later, longest_step
-from warp_abtree.kernels.motion.path import BEND_LEAST, SCALE_MAX
-from warp_abtree.kernels.motion.stalled import carry_on, plain_row, posed_row, words_type
+from warp_abtree.kernels.motion.path import BEND_LEAST
+from warp_abtree.kernels.motion.stalled import plain_row, posed_row, resolve_in_double_words, words_type
 from warp_abtree.kernels.search.item import INDEX_MASK, four_items, item_first, item_second
-from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, POSE_ROUNDING, corners_type, largest
+from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, POSE_ROUNDING, corners_type, largest_coordinate
 from warp_abtree.kernels.triangle.float64_filter import float64_filter_triangles
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -42,7 +42,7 @@ POSED_WORDS = wp.constant(wp.float64(2.0**-102))
 
 @wp.struct
 class LinearMotion:
-    """How the points of A and B move in A's first frame, and what is bounded over all of it."""
+    """Linear motion of the points of A and B in A's first frame, with bounds over all of it."""
 
     first: wp.mat33d  # R0
     offset: wp.vec3d  # x0
@@ -116,11 +116,11 @@ def bound_linear_motion(before: LinearMotion, states: StatePool, pose: PairPose,
     root_b = load_node(states, pose.node_b + 1)
     reach_a, reach_b = reach_box(root_a.lower, root_a.upper), reach_box(root_b.lower, root_b.upper)
     two = wp.float64(2.0)
-    away = largest(motion.centre_a) + largest(motion.centre_b)
-    travel = largest(motion.shift_a) + largest(motion.shift_b)
-    sizes = ((reach_a + reach_b) + away) + (largest(motion.offset) + travel)
+    away = largest_coordinate(motion.centre_a) + largest_coordinate(motion.centre_b)
+    travel = largest_coordinate(motion.shift_a) + largest_coordinate(motion.shift_b)
+    sizes = ((reach_a + reach_b) + away) + (largest_coordinate(motion.offset) + travel)
     motion.slack = (two * POSE_ROUNDING + wp.float64(6.0) * skew) * sizes
-    far = two * (largest(motion.offset) + travel) + two * away
+    far = two * (largest_coordinate(motion.offset) + travel) + two * away
     most = wp.max(wp.max(reach_a, reach_b), far)
     power = wp.cast(wp.cast(most, wp.int64) & EXPONENT_BITS, wp.float64)
     motion.scale = wp.min(wp.float64(1.0) / power, SCALE_MAX)
@@ -147,7 +147,7 @@ def see(node: Node, motion: LinearMotion, at: wp.mat33, shift: wp.vec3, way: wp.
 
 @wp.func
 def compare(a: Seen, b: Seen, before: wp.vec2) -> wp.vec2:
-    """Return the longest step and the widest gap along three axes, and of what was found before."""
+    """Return the longest step and the widest gap along three axes, and of those found before."""
     bend = wp.float32(BEND_LEAST)
     return longest_step(b.sum - a.sum, a.size + b.size, b.speed - a.speed, a.spread + b.spread, bend, before)
 
@@ -184,7 +184,7 @@ def advance_linear_children(
     item: wp.int64,
     live: wp.int32,
 ):
-    """Compare what an item names from t on, as `node_pair.advance_children`."""
+    """Expand an item from time t on, as `node_pair.advance_children`."""
     x, y = item_first(item), item_second(item)
     at_a, at_b = pose.node_a + (x & INDEX_MASK), pose.node_b + (y & INDEX_MASK)
     a0 = load_constant_node(states, at_a)
@@ -223,7 +223,7 @@ def advance_linear_children(
 def straight_step(
     slack: wp.float64, n: wp.vec3d, a: corners_type, b: corners_type, way_a: corners_type, way_b: corners_type
 ):
-    """Return how long corners stay apart for certain along a unit vector n, from A's to B's; ways err by slack."""
+    """Return a time for which corners certainly stay apart along a unit n, from A's to B's; motions err by slack."""
     step = wp.float64(wp.inf)
     for j in range(3):
         place, speed = wp.dot(n, a[j]) + slack, wp.dot(n, way_a[j]) + slack
@@ -243,8 +243,8 @@ def advance_straight(
     start: wp.float64,
     best: wp.float64,
 ):
-    """Return when two faces whose corners move straight first touch, or STALLED, as `face_pair.advance_faces`."""
-    contact = Contact()
+    """Advance two faces whose corners move straight to first contact, or STALLED, as `face_pair.advance_pair`."""
+    contact = FirstContact()
     t, steps = wp.float64(start), wp.int32(0)
     while steps < STEPS_MAX:
         steps += 1
@@ -292,19 +292,19 @@ def posed_corners(
     for k in range(3):
         corners[k] = posed_row(rotation[pair[0]], position[pair[0]], a[k])
         corners[3 + k] = posed_row(rotation[pair[1]], position[pair[1]], b[k])
-        size = wp.max(size, wp.max(largest(a[k]), largest(b[k])))
-    away = wp.max(largest(position[pair[0]]), largest(position[pair[1]]))
+        size = wp.max(size, wp.max(largest_coordinate(a[k]), largest_coordinate(b[k])))
+    away = wp.max(largest_coordinate(position[pair[0]]), largest_coordinate(position[pair[1]]))
     return corners, wp.float64(4.0) * size + away
 
 
 @wp.func(inline=False)
-def carry_on_in_world(
+def resolve_in_world(
     poses: EndPoses, pair: wp.vec2i, a: corners_type, b: corners_type, start: wp.float64, best: wp.float64
 ):
-    """Return the `Contact` of faces of models, see `stalled`."""
+    """Return the `FirstContact` of faces of models, see `stalled`."""
     starts, first = posed_corners(poses.rotation, poses.position, pair, a, b)
     ends, last = posed_corners(poses.end_rotation, poses.end_position, pair, a, b)
-    return carry_on(starts, ends, POSED_WORDS * wp.max(first, last), start, best)
+    return resolve_in_double_words(starts, ends, POSED_WORDS * wp.max(first, last), start, best)
 
 
 @wp.func
@@ -320,15 +320,15 @@ def advance_linear_pair(
     start: wp.float64,
     best: wp.float64,
 ):
-    """Return the `Contact` of a face of A and one of B."""
-    a = load_corners(models, states, pose.corner_a + face_a)
-    b = load_corners(models, states, pose.corner_b + face_b)
+    """Return the `FirstContact` of a face of A and one of B."""
+    a = load_face(models, states, pose.corner_a + face_a)
+    b = load_face(models, states, pose.corner_b + face_b)
     way_a = map_corners(motion.way_a, motion.shift_a, a)
     way_b = map_corners(motion.way_b, motion.shift_b, b)
     at_b = map_corners(motion.first, motion.offset, b)
     contact = advance_straight(tolerance, motion.slack, a, at_b, way_a, way_b, start, best)
     if contact.end == STALLED:
-        contact = carry_on_in_world(poses, motion.objects, a, b, contact.time, best)
+        contact = resolve_in_world(poses, motion.objects, a, b, contact.time, best)
     return contact
 
 
@@ -338,9 +338,9 @@ def advance_corners_kernel(
     rounding: wp.float64,
     starts: wp.array2d(dtype=wp.vec3d),
     ends: wp.array2d(dtype=wp.vec3d),
-    contact_out: wp.array(dtype=Contact),
+    contact_out: wp.array(dtype=FirstContact),
 ):
-    """Find when two faces first touch whose corners, A's and then B's, move straight, a pair a thread."""
+    """Find first contacts of faces whose corners, A's and then B's, move straight, a pair a thread."""
     i = wp.tid()
     a = wp.matrix_from_rows(starts[i, 0], starts[i, 1], starts[i, 2])
     b = wp.matrix_from_rows(starts[i, 3], starts[i, 4], starts[i, 5])
@@ -348,7 +348,7 @@ def advance_corners_kernel(
     d = wp.matrix_from_rows(ends[i, 3], ends[i, 4], ends[i, 5])
     size = wp.float64(0.0)
     for k in range(6):
-        size = wp.max(size, wp.max(largest(starts[i, k]), largest(ends[i, k])))
+        size = wp.max(size, wp.max(largest_coordinate(starts[i, k]), largest_coordinate(ends[i, k])))
     zero, one = wp.float64(0.0), wp.float64(1.0)
     contact = advance_straight(tolerance, rounding * size, a, b, c - a, d - b, zero, one)
     if contact.end == STALLED:
@@ -356,7 +356,7 @@ def advance_corners_kernel(
         for k in range(6):
             first[k] = plain_row(starts[i, k])
             last[k] = plain_row(ends[i, k])
-        contact = carry_on(first, last, zero, contact.time, one)
+        contact = resolve_in_double_words(first, last, zero, contact.time, one)
     if contact.end == CLEAR:
         contact.time = one
     contact_out[i] = contact

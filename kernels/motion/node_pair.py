@@ -1,7 +1,7 @@
-"""Until when a node pair stays apart, and the step of the search: a node pair, up to four pairs of children.
+"""Conservative advancement of two moving boxes, and the expansion of a node pair.
 
-Items are those of `traversal.node_pair`, each with a time up to which its boxes are proved apart. At that time boxes
-are compared along the axes of both frames, as in `traversal.boxes`; along each the gap g, the least speed s at which it
+Items are those of `search.item`, each with a time up to which its boxes are proved apart. At that time boxes
+are compared along the axes of both frames, as in `base.boxes`; along each the gap g, the least speed s at which it
 grows and the bound M of accelerations (`path`) give a time to which it stays open, and the latest counts. All numbers
 but times are twice what they say, and scaled.
 
@@ -51,7 +51,7 @@ class BoxMotion:
 
 @wp.struct
 class MovingBox:
-    """A box in its own frame, in the other's, and how fast its points move there."""
+    """A box in its own frame, in the other's, and the speeds of its points there."""
 
     at: PosedBox  # in both frames
     speed: wp.vec3  # twice that of its centre, other frame
@@ -91,7 +91,7 @@ def move_box(
 
 @wp.func
 def step_of(gap: wp.float32, rate: wp.float32, bend: wp.float32):
-    """Return how long a gap stays open that grows at a rate, less bend / 2 times the time squared; 0 if it is none."""
+    """Return a time for which a gap stays open under a rate and a deceleration of at most bend; 0 without a gap."""
     zero, two = wp.float32(0.0), wp.float32(2.0)
     root = wp.sqrt(rate * rate + two * bend * gap)
     above = wp.where(rate > zero, rate + root, two * gap)
@@ -103,7 +103,7 @@ def step_of(gap: wp.float32, rate: wp.float32, bend: wp.float32):
 def longest_step(
     between: wp.vec3, reach: wp.vec3, speed: wp.vec3, spread: wp.vec3, bend: wp.float32, best: wp.vec2
 ) -> wp.vec2:
-    """Return the longest step and the widest gap along three axes, and of what was found before."""
+    """Return the longest step and the widest gap along three axes, and of those found before."""
     step, widest = best[0], best[1]
     for i in range(3):
         gap = wp.abs(between[i]) - reach[i]
@@ -115,7 +115,7 @@ def longest_step(
 
 @wp.func
 def step_boxes(a: MovingBox, b: MovingBox, motion: Motion):
-    """Return how long two boxes stay apart, 0 if they may not be, and the widest gap between them."""
+    """Return a time for which two boxes stay apart, 0 if they may overlap, and the widest gap between them."""
     first = longest_step(
         b.at.posed_sum - a.at.sum, b.at.posed_size + a.at.size, b.speed, b.spread, motion.bend_b, wp.vec2()
     )
@@ -124,7 +124,7 @@ def step_boxes(a: MovingBox, b: MovingBox, motion: Motion):
 
 @wp.func
 def later(t: wp.float32, step: wp.float32):
-    """Return the time that a step leads to, rounded down; t where the step is lost to rounding."""
+    """Return the time at the end of a step, rounded down; t where the step is lost to rounding."""
     return wp.max(t, (t + step * LATER) * SUM_DOWN)
 
 
@@ -139,7 +139,7 @@ def go_on(
     then: wp.float32,
     best: wp.float64,
 ):
-    """Return what two nodes apart from t to a later time leave, and what it is.
+    """Return the item that two nodes apart from t to a later time emit, and its kind.
 
     Themselves again where they are far apart at t and there is a later time, else as `item_of`.
     """
@@ -161,7 +161,7 @@ def advance_children(
     item: wp.int64,
     live: wp.int32,
 ):
-    """Compare what an item names from t on; return the items that follow, what each is, their times, and how many.
+    """Expand an item from time t on; return the items that follow, their kinds and times, and how many were compared.
 
     live is -1, or 0 where nothing is asked of the item, which still names nodes. Times after `best` are dropped.
     """

@@ -1,4 +1,4 @@
-"""Paths of objects, and the motion of B in A's frame: where its points are at a time, how fast, and how far from that.
+"""Paths of objects, and the motion of B in A's frame: place, speed, and bounds of acceleration.
 
 An object's anchor, a point of its model frame, moves on a straight line at constant speed, and the object turns about
 it at constant angular velocity: x_world(t) = R E(t) (x - anchor) + start + t travel, E(t) the turn by t angle about an
@@ -30,15 +30,14 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.base.nodes import load_node
-from warp_abtree.kernels.base.poses import ROUNDING_32, PairPose, measure_rotation, reach_box, sum_products
+from warp_abtree.kernels.base.poses import ROUNDING_32, SCALE_MAX, PairPose, measure_rotation, reach_box, sum_products
 from warp_abtree.kernels.motion.turn import shortest_turn, turn_matrix
-from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, POSE_ROUNDING, largest
+from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, POSE_ROUNDING, largest_coordinate
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # That bounds of accelerations grow by: their own rounding, and rotations that are not quite orthonormal.
 GROW = wp.constant(wp.float64(1.0 + 2.0**-16))
-SCALE_MAX = wp.constant(wp.float64(2.0**100))
 # Sine of half a turn below which a screw's axis is too far away: the frame's origin moves straight then.
 SCREW_LEAST = wp.constant(wp.float64(2.0**-20))
 # What has no acceleration is given one, so that nothing is divided by 0.
@@ -47,7 +46,7 @@ BEND_LEAST = wp.constant(wp.float64(2.0**-80))
 
 @wp.struct
 class Paths:
-    """Each object's way, shape [object]."""
+    """Paths of objects, shape [object]."""
 
     axis: wp.array(dtype=wp.vec3d)  # of its turn, unit, model frame
     angle: wp.array(dtype=wp.float64)  # of its turn, 0 to pi; -1 where there is no shortest turn
@@ -58,7 +57,7 @@ class Paths:
 
 @wp.struct
 class Motion:
-    """The motion of B in A's frame, and what is bounded over all of it."""
+    """Motion of B in A's frame, with bounds over all of it."""
 
     first: wp.mat33d  # R0
     d0: wp.vec3d  # from A's anchor to B's, in A's first frame
@@ -85,7 +84,7 @@ class Motion:
 
 @wp.struct
 class Moment:
-    """Where B is in A's frame at a time, and how it moves: x = rotation b + shift, x' = spin b + speed."""
+    """Pose and velocity of B in A's frame at a time: x = rotation b + shift, x' = spin b + speed."""
 
     rotation: wp.mat33d  # R
     shift: wp.vec3d  # of points in the model frames
@@ -124,7 +123,7 @@ def place_motion(motion: Motion, t: wp.float64):
 
 @wp.func
 def reverse_moment(m: Moment):
-    """Return where A is in B's frame, and how it moves."""
+    """Return the pose of A in B's frame, and its velocity."""
     back = Moment()
     back.rotation = wp.transpose(m.rotation)
     back.shift = -(back.rotation * m.shift)
@@ -207,7 +206,7 @@ def start_motion(paths: Paths, models: ModelPool, states: StatePool, objects: Ob
 
 @wp.func
 def pair_skew(objects: ObjectPool, a: wp.int32, first: wp.mat33d):
-    """Return how far rotations of A, and of B in its frame, are off orthonormal."""
+    """Return the errors of orthonormality of the rotations of A, and of B in its frame."""
     own, _ = measure_rotation(objects.rotation[a])
     skew, _ = measure_rotation(first)
     return own + skew
@@ -234,16 +233,16 @@ def bound_motion(before: Motion, states: StatePool, pose: PairPose, skew: wp.flo
     motion.bend_size = wp.where(bend_b <= bend_a, size_b, size_a)
     motion.bend_rest = wp.where(bend_b <= bend_a, rest_b, rest_a)
     reach_a, reach_b = reach_box(root_a.lower, root_a.upper), reach_box(root_b.lower, root_b.upper)
-    way = wp.max(largest(motion.d0), largest(motion.d0 + motion.d1))
-    anchors = largest(motion.anchor_a) + largest(motion.anchor_b)
-    away = largest(away_a) + largest(away_b)
+    way = wp.max(largest_coordinate(motion.d0), largest_coordinate(motion.d0 + motion.d1))
+    anchors = largest_coordinate(motion.anchor_a) + largest_coordinate(motion.anchor_b)
+    away = largest_coordinate(away_a) + largest_coordinate(away_b)
     sizes = ((reach_a + reach_b) + away) + (way + anchors)
-    turn, travel = turn_a + turn_b, largest(motion.d1)
+    turn, travel = turn_a + turn_b, largest_coordinate(motion.d1)
     six, two = wp.float64(6.0), wp.float64(2.0)
     motion.slack = (two * POSE_ROUNDING + six * skew) * sizes
     speed = turn * sizes + travel
     motion.speed_slack = (two * POSE_ROUNDING + six * skew) * speed
-    # As `distance.frame.make_frame`, but for the whole way: centres are at most so far apart, and move so fast.
+    # As `distance.frame.make_scale`, but for the whole way: centres are at most so far apart, and move so fast.
     far = two * (way + away)
     most = wp.max(wp.max(reach_a, reach_b), wp.max(far, travel))
     power = wp.cast(wp.cast(most, wp.int64) & EXPONENT_BITS, wp.float64)

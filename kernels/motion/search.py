@@ -1,4 +1,4 @@
-"""The search of two trees for their first contact: depth first, the earliest children first.
+"""Branch and bound for the first contact of two trees: depth first, the earliest children first.
 
 Each node pair carries the time up to which it is proved apart, made of its own boxes and those above it alone, and is
 dropped if that is after the best time so far. So the earliest time is found whatever the order, on every device. A
@@ -15,10 +15,10 @@ from warp_abtree.kernels.base.arrays import ModelPool, StatePool
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.intersect.face_pairs import Hits
-from warp_abtree.kernels.motion.face_pair import CLEAR, TO_THE_END, TOUCHES, Contact, Progress
+from warp_abtree.kernels.motion.face_pair import CLEAR, TO_THE_END, TOUCHES, FirstContact, PairProgress
 from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
 from warp_abtree.kernels.motion.linear import EndPoses
-from warp_abtree.kernels.motion.start import OPEN, Contacts
+from warp_abtree.kernels.motion.start import OPEN, FirstContacts
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
 from warp_abtree.kernels.search.load_balance import take_thread, take_unit
 from warp_abtree.kernels.search.nearest_stack import push_nearest, read_bound, write_bound
@@ -33,11 +33,11 @@ LIST_WORDS = int(STRADDLING_START) + int(STRADDLING_START) // 2
 
 @wp.func_native(native.body("search/nearest_stack.cuh", "thread_lists"))
 def thread_lists(memory: wp.array2d(dtype=wp.int64), thread: wp.int32) -> wp.uint64:
-    """Return where the lists of a thread of the CPU lie."""
+    """Return the address of a CPU thread's lists."""
 
 
 @wp.func
-def meet_faces(
+def advance_face_pair(
     items: wp.uint64,
     i: wp.int32,
     tolerance: wp.float64,
@@ -46,11 +46,11 @@ def meet_faces(
     poses: EndPoses,
     pose: PairPose,
     motion: Any,
-    before: Contact,
+    before: FirstContact,
 ):
     """Advance the i-th face pair; return the earliest contact so far, and how many pairs were compared."""
     best = before
-    progress = Progress()
+    progress = PairProgress()
     progress.time = wp.float64(read_bound(items, STACK_LENGTH + i))
     progress.mode = TO_THE_END
     if progress.time > best.time:
@@ -77,7 +77,7 @@ def search_contact(
     start: wp.float64,
 ):
     """Return the first contact of an object pair that is apart until a start, and how many pairs were compared."""
-    best = Contact()
+    best = FirstContact()
     best.time = wp.float64(1.0)
     best.end = CLEAR
     write_item(items, 0, first_item(states, pose))
@@ -87,7 +87,7 @@ def search_contact(
     while end > 0 or waiting > 0:
         if waiting > 0:
             waiting -= 1
-            best, advanced = meet_faces(items, waiting, tolerance, models, states, poses, pose, motions[p], best)
+            best, advanced = advance_face_pair(items, waiting, tolerance, models, states, poses, pose, motions[p], best)
             tests[1] += advanced
         else:
             end -= 1
@@ -118,7 +118,7 @@ def thread_search(kind):
         motion: wp.array(dtype=kind),
         # out
         hits_inout: Hits,
-        contacts_inout: Contacts,
+        contacts_inout: FirstContacts,
         memory_out: wp.array2d(dtype=wp.int64),
     ):
         """Take one object pair after the other that is open, and search it; CPU only."""

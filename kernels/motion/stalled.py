@@ -1,5 +1,4 @@
-"""What float64 cannot tell apart: faces whose corners move straight, from where steps along a direction end, in double
-words.
+"""Double-word fallback of linear CCD: vertex-face and edge-edge pairs on which float64 advancement stalls.
 
 Faces that are apart at first meet first where a corner of one meets the other face, or two edges meet. Each of these 15
 pairs is proved apart on the way (`native/exact/moving_features.h`), from one time to the next:
@@ -18,8 +17,8 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.exact.double_word import add_double
 from warp_abtree.kernels.exact.expansion import two_product
-from warp_abtree.kernels.motion.face_pair import Contact, separating_direction
-from warp_abtree.kernels.triangle.distance import largest
+from warp_abtree.kernels.motion.face_pair import FirstContact, separating_direction
+from warp_abtree.kernels.triangle.distance import largest_coordinate
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -34,7 +33,7 @@ BEYOND = wp.constant(wp.float64(2.0**-50))
 def apart_until(
     starts: words_type, ends: words_type, away: wp.vec3d, error: wp.float64, start: wp.float64, limit: wp.float64
 ) -> wp.vec2d:
-    """Return until when faces stay apart, no later than a limit, and how they end: CLEAR, TOUCHES or UNDECIDED.
+    """Return the time until which faces stay apart, up to a limit, and the outcome: CLEAR, TOUCHES or UNDECIDED.
 
     Args:
         starts, ends: Where corners are at first and at last, in any frame.
@@ -70,18 +69,20 @@ def posed_row(rotation: wp.mat33d, position: wp.vec3d, v: wp.vec3d):
 
 
 @wp.func
-def carry_on(starts: words_type, ends: words_type, error: wp.float64, start: wp.float64, best: wp.float64):
-    """Return when faces that are apart before a start first touch, if not after the best time so far."""
+def resolve_in_double_words(
+    starts: words_type, ends: words_type, error: wp.float64, start: wp.float64, best: wp.float64
+):
+    """Find the first contact of faces that are apart before a start, up to the best time so far."""
     size, away = wp.float64(0.0), wp.vec3d()
     if start == wp.float64(0.0):
         for k in range(6):
-            size = wp.max(size, largest(rounded(starts[k])))
+            size = wp.max(size, largest_coordinate(rounded(starts[k])))
         a = wp.matrix_from_rows(rounded(starts[0]), rounded(starts[1]), rounded(starts[2]))
         b = wp.matrix_from_rows(rounded(starts[3]), rounded(starts[4]), rounded(starts[5]))
         # A unit vector has a coordinate over a half, and 8 sizes along it are farther than boxes reach.
         away = wp.float64(16.0) * size * separating_direction(a, b)
     found = apart_until(starts, ends, away, error, start, wp.min(best + BEYOND, wp.float64(1.0)))
-    contact = Contact()
+    contact = FirstContact()
     contact.time = found[0]
     contact.end = wp.int32(found[1])
     return contact

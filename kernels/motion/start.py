@@ -1,4 +1,4 @@
-"""The start of a search for first contacts: boxes of whole ways, each pair's motion, and steps of both roots.
+"""Start of a search for first contacts: swept boxes, each pair's motion, and advancement of both roots.
 
 A way is cut into parts for the boxes of the broad phase. Within a part of length h a point leaves the chord between
 its ends by at most M h^2 / 8, M the bound of its acceleration: turn^2 times its distance from the anchor. So the boxes
@@ -14,8 +14,7 @@ from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.base.boxes import round_down, round_up
 from warp_abtree.kernels.base.generation import STALE, LaunchRecord, is_stale
 from warp_abtree.kernels.base.nodes import load_node
-from warp_abtree.kernels.base.poses import PairPose, measure_skew
-from warp_abtree.kernels.intersect.broad_phase import ROUNDING_64
+from warp_abtree.kernels.base.poses import ROUNDING_64, PairPose, measure_skew
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED
 from warp_abtree.kernels.motion.kinds import advance_nodes, has_way, make_motion
@@ -34,8 +33,8 @@ PARTS = wp.constant(8)
 
 
 @wp.struct
-class Contacts:
-    """Answers, an entry an object pair."""
+class FirstContacts:
+    """First contacts, an entry an object pair."""
 
     time: wp.array(dtype=wp.float64)  # of first contact, 1 where clear
     end: wp.array(dtype=wp.int32)  # CLEAR, TOUCHES, UNDECIDED, OPEN or HALF_TURN
@@ -44,8 +43,8 @@ class Contacts:
 
 
 @wp.struct
-class Ways:
-    """Where objects go."""
+class Motions:
+    """Paths and end poses of objects."""
 
     paths: Paths  # the way of each
     ends: ObjectPool  # their poses at the end
@@ -53,7 +52,7 @@ class Ways:
 
 @wp.func
 def advance_roots(states: StatePool, pose: PairPose, motion: Any):
-    """Return a time until which two roots stay apart, as the search finds it, and whether that is all the way."""
+    """Advance two roots; return a time until which they stay apart, whether it is the end, and the tests made."""
     t = wp.float32(0.0)
     item = first_item(states, pose)
     tests = wp.int32(0)
@@ -77,15 +76,15 @@ def contact_starter(kind):
         models: ModelPool,
         states: StatePool,
         objects: ObjectPool,
-        ways: Ways,
+        motions: Motions,
         pair_count: wp.array(dtype=wp.int32),
         pairs: wp.array(dtype=wp.vec2i),
         pair_poses: wp.array(dtype=PairPose),
         hits_inout: Hits,
-        contacts_inout: Contacts,
+        contacts_inout: FirstContacts,
         motion_out: wp.array(dtype=kind),
     ):
-        """Prepare an object pair a thread: decide what intersects at first, and what the root boxes prove clear."""
+        """Prepare an object pair a thread: settle pairs that intersect at first, or that the root boxes prove clear."""
         p = wp.tid()
         if p == 0:
             contacts_inout.counter[1] = 0
@@ -98,10 +97,10 @@ def contact_starter(kind):
             contacts_inout.end[p] = TOUCHES
             return
         motion = kind()
-        if not has_way(motion, ways.paths, pair):
+        if not has_way(motion, motions.paths, pair):
             contacts_inout.end[p] = HALF_TURN
             return
-        motion = make_motion(motion, ways.paths, ways.ends, models, states, objects, pair_poses[p], pair)
+        motion = make_motion(motion, motions.paths, motions.ends, models, states, objects, pair_poses[p], pair)
         if not (motion.slack < wp.float64(wp.inf)):
             # Beyond float64, or no numbers: nothing could be proved.
             contacts_inout.end[p] = UNDECIDED

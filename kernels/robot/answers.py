@@ -1,4 +1,4 @@
-"""Answers of a robot's configurations, of those of their pairs of objects."""
+"""Answers of a robot's configurations, reduced from those of their pairs of objects."""
 
 import warp as wp
 
@@ -13,8 +13,8 @@ NO_PAIR = wp.constant(wp.int64(2**63 - 1))
 
 
 @wp.struct
-class Nearest:
-    """Where the nearest pair of each configuration is nearest."""
+class NearestParts:
+    """Nearest pair of each configuration."""
 
     winner: wp.array(dtype=wp.int64)  # of a stage: the least pair at the least distance, NO_PAIR; shape [configuration]
     distance: wp.array(dtype=wp.float64)  # [robot units], infinite where none is near enough, shape [configuration]
@@ -31,7 +31,7 @@ def configuration_of(pair: wp.vec2i, around: wp.int32, part_count: wp.int32):
 
 @wp.func
 def note_demand(pair_count: wp.array(dtype=wp.int32), hits: Hits, demand: wp.array(dtype=wp.int32)):
-    """Note the pairs that a stage found, and those of faces that waited, where they are more than before."""
+    """Raise the demands of a chunk to those of a stage: pairs found, and face pairs that waited."""
     demand[0] = wp.where(pair_count[0] < 0, 2147483647, wp.max(demand[0], pair_count[0]))
     waited = hits.uncertain_total[0]
     demand[1] = wp.where(waited < 0, 2147483647, wp.max(demand[1], waited))
@@ -91,7 +91,7 @@ def find_winner_kernel(
     pairs: wp.array(dtype=wp.vec2i),
     distances: Distances,
     chunk: Chunk,
-    nearest_inout: Nearest,
+    nearest_inout: NearestParts,
 ):
     """Find the first of the pairs at the least distance of each configuration, if that has become less."""
     p = wp.tid()
@@ -110,10 +110,10 @@ def write_nearest_kernel(
     pair_count: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
     distances: Distances,
-    nearest_inout: Nearest,
+    nearest_inout: NearestParts,
     chunk_inout: Chunk,
 ):
-    """Write the answers of the pairs that `find_winner_kernel` has found; what intersects is decided."""
+    """Write the answers of the pairs of `find_winner_kernel`; pairs that intersect are settled."""
     p = wp.tid()
     if p >= wp.min(pair_count[0], pairs.shape[0]):
         return

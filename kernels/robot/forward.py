@@ -28,7 +28,7 @@ QUARTER_3 = wp.constant(wp.float64(2.02226624879595063154e-21))
 LIMIT_ROUNDING = wp.constant(wp.float64(2.0**-22))
 LIMIT_ROUNDING_DOUBLE = wp.constant(wp.float64(2.0**-51))
 
-NONE_REFUSED = wp.constant(wp.int64(2**63 - 1))
+NO_BAD_NUMBER = wp.constant(wp.int64(2**63 - 1))
 
 
 @wp.struct
@@ -121,7 +121,7 @@ def check_configuration_kernel(
 
     Args:
         limited: Whether limits are kept to, 0 or 1.
-        first_inout: Where it is, configuration * values + value, NONE_REFUSED for none, shape [1].
+        first_inout: Where it is, configuration * values + value, NO_BAD_NUMBER for none, shape [1].
     """
     i = wp.tid()
     if i >= count:

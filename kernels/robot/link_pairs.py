@@ -1,4 +1,4 @@
-"""The pairs of a robot's parts, and of parts and what surrounds them, that may meet or come near: by boxes.
+"""Broad phase of robots: pairs of parts, and of parts and surroundings, whose boxes are near.
 
 A configuration is asked part by part, and no more once it is decided. Edges of a planner ask how far the points of a
 part are from where they stand at the middle of a stretch of the edge. To get from there to any other configuration of
@@ -20,11 +20,11 @@ from warp_abtree.kernels.robot.forward import PRISMATIC, REVOLUTE, Chain, Frames
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-ANY, WITHIN, DISTANCE = wp.constant(0), wp.constant(1), wp.constant(2)
+ASK_ANY, ASK_WITHIN, ASK_DISTANCE = wp.constant(0), wp.constant(1), wp.constant(2)
 
 # Of a reach, where fixed transforms are rigid within 1e-12; and of poses: a frame turns what hangs on it by some 50 u
 # too much, u = 2^-53, and these add up along the way.
-REACH_ROUNDING = wp.constant(wp.float64(1.0 + 2.0**-30))
+RIGID_ROUNDING = wp.constant(wp.float64(1.0 + 2.0**-30))
 FRAME_ROUNDING = wp.constant(wp.float64(2.0**-45))
 # Nothing of a size that models may have is farther away.
 FARTHEST = wp.constant(wp.float64(2.0**120))
@@ -50,19 +50,19 @@ class Parts:
 
 @wp.struct
 class Chunk:
-    """Configurations that are asked at a time, and what is known of them."""
+    """Configurations that are checked at a time, and their states so far."""
 
     count: wp.array(dtype=wp.int32)  # of configurations, shape [1]
-    half: wp.array2d(dtype=wp.float64)  # what joint values may differ by, shape [configuration, column]; of WITHIN
-    size: wp.array2d(dtype=wp.float64)  # greatest magnitude of joint values, shape [configuration, column]; of WITHIN
+    half: wp.array2d(dtype=wp.float64)  # what joint values may differ by, shape [configuration, column]; of ASK_WITHIN
+    size: wp.array2d(dtype=wp.float64)  # greatest magnitudes of joint values, as `half`; of ASK_WITHIN
     hit: wp.array(dtype=wp.uint8)  # whether it is decided that parts intersect, shape [configuration]
-    near: wp.array(dtype=wp.uint8)  # whether some are not proved farther apart, shape [configuration]; of WITHIN
-    best: wp.array(dtype=wp.float64)  # least distance so far [robot units], shape [configuration]; of DISTANCE
+    near: wp.array(dtype=wp.uint8)  # whether some are not proved farther apart, shape [configuration]; of ASK_WITHIN
+    best: wp.array(dtype=wp.float64)  # least distance so far [robot units], shape [configuration]; of ASK_DISTANCE
 
 
 @wp.func
 def part_reach(chain: Chain, frames: Frames, parts: Parts, chunk: Chunk, i: wp.int32, part: wp.int32, shared: wp.int32):
-    """Return how far any point of a part may be from where it stands, seen from a frame that it hangs on."""
+    """Bound the motion of a part within the tolerances of joint values, seen from a frame that it hangs on."""
     f = parts.frame[part]
     radius = parts.radius[part]
     point = frames.rotation[i, f] * parts.middle[part] + frames.position[i, f]
@@ -84,15 +84,15 @@ def part_reach(chain: Chain, frames: Frames, parts: Parts, chunk: Chunk, i: wp.i
                 reach += value
         f = chain.parent[f]
     depth = wp.float64(parts.depth[part])
-    return reach * REACH_ROUNDING + FRAME_ROUNDING * (depth * depth) * size
+    return reach * RIGID_ROUNDING + FRAME_ROUNDING * (depth * depth) * size
 
 
 @wp.func
 def pair_reach(mode: wp.int32, chain: Chain, frames: Frames, parts: Parts, chunk: Chunk, i: wp.int32, entry: wp.int32):
-    """Return up to what distance the parts of an entry matter at a configuration [robot units]."""
-    if mode == ANY:
+    """Return the distance within which the parts of an entry are tested at a configuration [robot units]."""
+    if mode == ASK_ANY:
         return wp.float64(0.0)
-    if mode == DISTANCE:
+    if mode == ASK_DISTANCE:
         return chunk.best[i]
     shared, second = parts.shared[entry], parts.second[entry]
     reach = part_reach(chain, frames, parts, chunk, i, parts.first[entry], shared)
@@ -102,7 +102,7 @@ def pair_reach(mode: wp.int32, chain: Chain, frames: Frames, parts: Parts, chunk
 
 
 @wp.func
-def append_pair(
+def append_link_pair(
     first: wp.int32,
     second: wp.int32,
     distance: wp.float64,
@@ -161,10 +161,10 @@ def find_link_pair_kernel(
         first, second = base + parts.first[entry], parts.second[entry]
         reach = pair_reach(mode, chain, frames, parts, chunk_inout, i, entry)
         wide = wp.float64(reach)
-        if mode == WITHIN and reach > HOPELESS * parts.radius[parts.first[entry]]:
+        if mode == ASK_WITHIN and reach > HOPELESS * parts.radius[parts.first[entry]]:
             reach = wp.float64(0.0)
         least, most = lower[first], upper[first]
-        if mode != ANY:
+        if mode != ASK_ANY:
             for k in range(3):
                 least[k] = round_down(wp.max(wp.float64(least[k]) - wide, -FARTHEST))
                 most[k] = round_up(wp.min(wp.float64(most[k]) + wide, FARTHEST))
@@ -174,10 +174,10 @@ def find_link_pair_kernel(
                 if parts.meets[j] != wp.uint8(0):
                     if wide > reach:
                         chunk_inout.near[i] = wp.uint8(1)
-                    append_pair(first, j, reach, pair_count_inout, pairs_out, distances_out)
+                    append_link_pair(first, j, reach, pair_count_inout, pairs_out, distances_out)
         else:
             j = base + second
             if boxes_meet(least, most, lower[j], upper[j]):
                 if wide > reach:
                     chunk_inout.near[i] = wp.uint8(1)
-                append_pair(first, j, reach, pair_count_inout, pairs_out, distances_out)
+                append_link_pair(first, j, reach, pair_count_inout, pairs_out, distances_out)

@@ -1,1 +1,1 @@
-"""What every search of two trees shares: items, stacks, load balancing, slabs."""
+"""Searches of two trees: items, stacks, load balancing, slabs."""

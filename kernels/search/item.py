@@ -57,7 +57,7 @@ def first_item(states: StatePool, pose: PairPose):
 
 @wp.struct
 class Child:
-    """A node in a node pair test: its box in both frames, and what it stands for."""
+    """A node in a node pair test: its box in both frames, and its place in the tree."""
 
     box: PosedBox  # in its own frame and in the other one
     span: wp.float32  # minus the sum of the box's extents; not negative at a leaf, whose face number its bits are
@@ -104,7 +104,7 @@ def next_item(a: Child, b: Child):
 
 @wp.func
 def list_of_pair(used: wp.int32, inner: wp.int32, a: Child, b: Child):
-    """Return the list that two children are for, TO_NONE unless they overlap and `used` is negative."""
+    """Return the list that a pair of children goes to, TO_NONE unless they overlap and `used` is negative."""
     to = wp.where((a.face | b.face) >= 0, TO_LEAF_PAIRS, inner)
     return wp.where(boxes_overlap(a.box, b.box), wp.where(used < 0, to, TO_NONE), TO_NONE)
 
@@ -119,7 +119,7 @@ def have_slabs(floor: wp.vec2i, item: wp.int64):
 
 @wp.func
 def compare_node_pair(states: StatePool, pose: PairPose, floor: wp.vec2i, item: wp.int64, live: wp.int32):
-    """Compare what an item names; return the items that follow, their lists, and the pairs of boxes compared.
+    """Expand an item; return the items that follow, their lists, and the pairs of boxes compared.
 
     No branches: the lanes of a warp stay together, and all loads are under way at once. A node compared alone is its
     own sibling.
@@ -158,7 +158,7 @@ def compare_node_pair(states: StatePool, pose: PairPose, floor: wp.vec2i, item: 
 
 @wp.func
 def item_of(a: Node, b: Node):
-    """Return the item that two nodes leave: their faces, where both are leaves.
+    """Return the item of two nodes: their faces, where both are leaves.
 
     Else the next step goes down both, or only the one that is more than twice as large as the other, or no leaf.
     """

@@ -1,4 +1,4 @@
-"""Dynamic load balancing between warps: idle warps wait in a queue; busy warps donate the oldest items of their stack.
+"""Work stealing between warps: idle warps wait in a queue; busy warps donate the oldest items of their stack.
 
 Units of work are numbered. A warp starts with that of its own number, takes the next one until there are no more, then
 a ticket, and waits at the slot of
@@ -67,7 +67,7 @@ balance_code = functools.partial(native.body, "search/load_balance.cuh")
 
 @wp.func_native(balance_code("first_ended"))
 def first_ended(descends: bool, counter: wp.array(dtype=wp.int32)) -> wp.int32:
-    """Return 0 units and donations ended, or less than any number where all pairs are small: nothing is given away."""
+    """Return the initial count of units and donations ended: 0, or a very negative one where nothing is given away."""
 
 
 @wp.func_native(balance_code("first_unit"))
@@ -82,7 +82,7 @@ def take_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
 
 @wp.func_native(balance_code("claim_unit"))
 def claim_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
-    """Return what `take_unit` does, in the first lane alone, so that nobody waits for it yet."""
+    """Take a unit as `take_unit`, in the first lane alone, without waiting for the atomic."""
 
 
 @wp.func_native(balance_code("load_tickets"))
@@ -114,7 +114,7 @@ def claim_slot(counter: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32)
 
 @wp.func_native(balance_code("fill_slot"))
 def fill_slot(flag: wp.array(dtype=wp.int32), ticket: wp.int32):
-    """Hand over what this warp has put into the slot of a ticket."""
+    """Publish the items that this warp has put into the slot of a ticket."""
 
 
 @wp.func
@@ -125,7 +125,7 @@ def note_descent(work: Work):
 
 @wp.func
 def units_per_pair(warps_per_pair: wp.int32, count: wp.int32):
-    """Return how many units an object pair is at first; more of them cost more, since each starts at the roots."""
+    """Return the number of units that a pair is split into at first; more cost more, since each starts at the roots."""
     return wp.max(1, wp.int32(wp.float32(warps_per_pair) / wp.sqrt(wp.float32(wp.max(count, 1)))))
 
 
@@ -157,13 +157,13 @@ def next_unit(ended: wp.int32, unit: wp.int32, units: wp.int32, work: Work):
 
 @wp.func
 def parts_at_once(parts: wp.int32, count: wp.int32, warps: wp.int32):
-    """Return by how many units a pair is divided that each starts with as much work as the whole pair."""
+    """Return the number of units to split a pair into when each unit repeats its start-up work."""
     return wp.clamp(warps / wp.max(count, 1), 1, parts)
 
 
 @wp.func
 def units_of_pair(ended: wp.int32, count: wp.int32, work: Work):
-    """Return how many units an object pair is: no more than start at once where all pairs are small."""
+    """Return the number of units of an object pair: no more than start at once where all pairs are small."""
     parts = units_per_pair(work.warps_per_pair, count)
     if ended < 0:
         parts = parts_at_once(parts, count, work.warps)
@@ -181,7 +181,7 @@ def await_items(ended: wp.int32, work: Work):
 
 @wp.func
 def start_level(level: wp.int32, faces: wp.int32):
-    """Return the level of a tree to start from: so deep that two faces or more lie below a node, on average."""
+    """Return the level of a tree to start from, the deepest with two faces or more below a node, on average."""
     while level > 0 and (2 << level) > faces:
         level -= 1
     return level
@@ -222,7 +222,7 @@ def start_items(items: wp.uint64, part: wp.int32, parts: wp.int32, pose: PairPos
 
 @wp.func
 def receive_items(items: wp.uint64, slot: wp.int32, work: Work):
-    """Put what lies in a slot on the empty stack; return the stack's end."""
+    """Copy the items of a slot to the empty stack; return the stack's end."""
     size = work.owner[slot][1]
     lane = warp_lane()
     if lane < size:
@@ -235,7 +235,7 @@ def receive_items(items: wp.uint64, slot: wp.int32, work: Work):
 def donate_items(
     least: wp.int32, pair: wp.int32, idle: wp.int32, items: wp.uint64, head: wp.int32, end: wp.int32, work: Work
 ):
-    """Serve idle warps with the oldest items, so many each at least: most lies below them. Return the new head."""
+    """Donate the oldest items to idle warps, so many each at least: most work lies below them. Return the new head."""
     wanted = wp.min(idle, DONATIONS_AT_ONCE)
     size = wp.min(wp.max((end - head) / (wanted + 1), least), SLOT_ITEMS)
     lane = warp_lane()

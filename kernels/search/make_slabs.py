@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.struct
 class Extent:
-    """How far faces reach along a direction."""
+    """Extent of faces along a direction."""
 
     direction: wp.vec3d  # whole numbers
     low: wp.float64  # least product with it
@@ -29,7 +29,7 @@ def face_below(models: ModelPool, start: wp.int32, node: wp.int32, level: wp.int
 
 
 @wp.func
-def face_normal(models: ModelPool, corner: wp.vec3i):
+def original_normal(models: ModelPool, corner: wp.vec3i):
     """Return the unit normal of a face, 0 where it has no area."""
     a = load_vertex(models.vertex_pos, corner[0])
     n = wp.cross(load_vertex(models.vertex_pos, corner[1]) - a, load_vertex(models.vertex_pos, corner[2]) - a)
@@ -50,7 +50,7 @@ def whole_direction(n: wp.vec3d):
 
 @wp.func
 def measure_faces(models: ModelPool, model: wp.int32, node: wp.int32, level: wp.int32, direction: wp.vec3d):
-    """Return how far the faces below a node reach along a direction."""
+    """Return the extent of the faces below a node along a direction."""
     extent = Extent()
     extent.direction = direction
     extent.low = wp.float64(wp.inf)
@@ -94,7 +94,7 @@ def measure_box(models: ModelPool, model: wp.int32, node: wp.int32, level: wp.in
 
 @wp.func
 def gain_of(widths: wp.vec3d, slab: Extent):
-    """Return by how much a box is wider than a slab, along the slab's direction, see `poses.SLAB_GAIN_UNIT`."""
+    """Return the excess of a box's width over a slab's, along the slab's direction, see `poses.SLAB_GAIN_UNIT`."""
     n = slab.direction
     whole = (wp.abs(n[0]) * widths[0] + wp.abs(n[1]) * widths[1]) + wp.abs(n[2]) * widths[2]
     most = wp.float64(DIRECTION_LENGTH) * ((widths[0] + widths[1]) + widths[2])
@@ -126,7 +126,7 @@ def make_slab_kernel(
     for i in range(1 << level):
         face = face_below(models, start, node, level, i)
         if face >= 0:
-            mean += face_normal(models, models.face_vertex[models.face_start[model] + face])
+            mean += original_normal(models, models.face_vertex[models.face_start[model] + face])
             count += 1
     if count == 0:
         slab_out[start + node] = wp.vec4()
@@ -137,7 +137,7 @@ def make_slab_kernel(
     for i in range(1 << level):
         face = face_below(models, start, node, level, i)
         if face >= 0:
-            normal = face_normal(models, models.face_vertex[models.face_start[model] + face])
+            normal = original_normal(models, models.face_vertex[models.face_start[model] + face])
             extent = measure_faces(models, model, node, level, whole_direction(normal))
             if extent.high - extent.low < best.high - best.low:
                 best = extent

@@ -1,8 +1,8 @@
-"""Slabs of nodes: how far the faces below a node reach along their mean normal, both ways.
+"""Slabs of nodes along the mean normal of the faces below, for bounds of distances.
 
 A box has corners that no face has. Along the direction in which two surfaces are nearest, faces that look that way
 reach no farther than their slab, so a node's box and slab together bound it closely (`slab_bound`, on the CPU
-`nearest/boxes.h`). The slabs of a state at a LOD are made once so many pairs have been searched without that it pays:
+`distance/boxes.h`). The slabs of a state at a LOD are made once so many pairs have been searched without that it pays:
 on the CPU by the thread that counts, on CUDA by blocks that share its subtrees.
 
 A slab is two entries of 16 bytes a node, as `nodes.Node` has:
@@ -25,13 +25,13 @@ wp.set_module_options(MODULE_OPTIONS)
 
 # Pairs that are searched without slabs of a state before these are made: it takes about as long as so many save.
 USES_MIN = wp.constant(16)
-THREADS = 256  # of a block that makes slabs
+SLAB_THREADS = 256  # of a block that makes slabs
 SUBTREE_LEVELS = wp.constant(10)  # of those that blocks share
 
 
 @wp.struct
 class Slabs:
-    """Slabs of all states, and what they were made of."""
+    """Slabs of all tree states, and the LODs that they were made at."""
 
     record: wp.array(dtype=wp.vec4)  # two entries a node of the pool, shape [2 node]
     made: wp.array(dtype=wp.vec3i)  # (LOD, model, where its nodes begin) of what they are of, shape [state]
@@ -43,8 +43,8 @@ class Slabs:
 
 
 @wp.struct
-class Slab:
-    """What lies below a node: low <= normal . x <= high, x about the model's centre."""
+class MeanSlab:
+    """Slab of the faces below a node: low <= normal . x <= high, x about the model's centre."""
 
     normal: wp.vec3  # unit, or 0
     low: wp.float32  # least
@@ -55,7 +55,7 @@ class Slab:
 
 @wp.func_native(native.body("search/slabs.cuh", "is_last_block"))
 def is_last_block(ended: wp.array(dtype=wp.int32), i: wp.int32, amount: wp.int32, whole: wp.int32) -> bool:
-    """Add what this block has ended; return whether it is the last, which then sees what the others have written."""
+    """Add to the work ended; return whether this block is the last, which then sees what the others have written."""
 
 
 @wp.func_native(native.body("search/slabs.cuh", "load_written"))
@@ -64,10 +64,10 @@ def load_written(values: wp.array(dtype=wp.vec4), i: wp.int64) -> wp.vec4:
 
 
 @wp.func
-def load_slab(slabs: Slabs, at: wp.int32):
+def load_mean_slab(slabs: Slabs, at: wp.int32):
     i = wp.int64(2) * wp.int64(at)
     first, second = load_written(slabs.record, i), load_written(slabs.record, i + wp.int64(1))
-    slab = Slab()
+    slab = MeanSlab()
     slab.normal = wp.vec3(first[0], first[1], first[2])
     slab.low = first[3]
     slab.high = second[0]
@@ -77,7 +77,7 @@ def load_slab(slabs: Slabs, at: wp.int32):
 
 
 @wp.func
-def store_slab(slabs: Slabs, at: wp.int32, slab: Slab):
+def store_mean_slab(slabs: Slabs, at: wp.int32, slab: MeanSlab):
     n = slab.normal
     i = wp.int64(2) * wp.int64(at)
     store_entry(slabs.record, i, wp.vec4(n[0], n[1], n[2], slab.low))
@@ -85,10 +85,10 @@ def store_slab(slabs: Slabs, at: wp.int32, slab: Slab):
 
 
 @wp.func
-def set_normal(slab: Slab, sum: wp.vec3d):
+def set_normal(slab: MeanSlab, sum: wp.vec3d):
     """Return a slab along a sum of normals, its extent open."""
     length = wp.length(sum)
-    made = Slab()
+    made = MeanSlab()
     made.low = slab.low
     made.high = slab.high
     made.weight = wp.float32(length)
@@ -113,7 +113,7 @@ def face_slab(models: ModelPool, states: StatePool, node: Node, at: wp.int32):
     a = wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
     b = wp.vec3d(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]))
     d = wp.vec3d(wp.float64(r[0]), wp.float64(r[1]), wp.float64(r[2]))
-    slab = set_normal(Slab(), wp.cross(b - a, d - a))
+    slab = set_normal(MeanSlab(), wp.cross(b - a, d - a))
     n = wp.vec3d(slab.normal)
     slab.low = round_down(wp.min(wp.min(wp.dot(n, a), wp.dot(n, b)), wp.dot(n, d)))
     slab.high = round_up(wp.max(wp.max(wp.dot(n, a), wp.dot(n, b)), wp.dot(n, d)))
@@ -123,7 +123,7 @@ def face_slab(models: ModelPool, states: StatePool, node: Node, at: wp.int32):
 
 
 @wp.func
-def top_of(node: Node, slab: Slab, n: wp.vec3d):
+def node_top(node: Node, slab: MeanSlab, n: wp.vec3d):
     """Return an upper bound of n . x below a node, by its box and slab."""
     m = wp.vec3d(slab.normal)
     along = wp.dot(n, m)
@@ -140,13 +140,13 @@ def top_of(node: Node, slab: Slab, n: wp.vec3d):
 @wp.func
 def join_slabs(states: StatePool, slabs: Slabs, node: Node, at: wp.int32):
     """Return the slab of a node whose children are two siblings of the pool."""
-    first, second = load_slab(slabs, at), load_slab(slabs, at + 1)
+    first, second = load_mean_slab(slabs, at), load_mean_slab(slabs, at + 1)
     sum = wp.float64(first.weight) * wp.vec3d(first.normal) + wp.float64(second.weight) * wp.vec3d(second.normal)
-    slab = set_normal(Slab(), sum)
+    slab = set_normal(MeanSlab(), sum)
     n = wp.vec3d(slab.normal)
     a, b = load_node(states, at), load_node(states, at + 1)
-    slab.high = round_up(wp.max(top_of(a, first, n), top_of(b, second, n)))
-    slab.low = round_down(-wp.max(top_of(a, first, -n), top_of(b, second, -n)))
+    slab.high = round_up(wp.max(node_top(a, first, n), node_top(b, second, n)))
+    slab.low = round_down(-wp.max(node_top(a, first, -n), node_top(b, second, -n)))
     m = middle_of(node)
     one = wp.length(middle_of(a) - m) + wp.float64(first.radius)
     other = wp.length(middle_of(b) - m) + wp.float64(second.radius)
@@ -162,16 +162,16 @@ def make_slab(models: ModelPool, states: StatePool, slabs: Slabs, state: wp.int3
     node = load_node(states, start + i)
     if node.skip >= 0:
         if node.face >= 0:
-            store_slab(slabs, start + i, face_slab(models, states, node, states.face_start[state] + node.face))
+            store_mean_slab(slabs, start + i, face_slab(models, states, node, states.face_start[state] + node.face))
         elif node.skip != i:
-            store_slab(slabs, start + i, load_slab(slabs, start + node.skip))
+            store_mean_slab(slabs, start + i, load_mean_slab(slabs, start + node.skip))
         else:
-            store_slab(slabs, start + i, join_slabs(states, slabs, node, start + 2 * i))
+            store_mean_slab(slabs, start + i, join_slabs(states, slabs, node, start + 2 * i))
 
 
 @wp.func
 def key_of(states: StatePool, state: wp.int32):
-    """Return what slabs of a state are of."""
+    """Return the key of a state's slabs: its LOD, model and place."""
     return wp.vec3i(states.lod[state], states.model[state], states.node_start[state])
 
 
@@ -182,7 +182,7 @@ def is_made(states: StatePool, slabs: Slabs, state: wp.int32):
 
 
 @wp.func
-def has_slabs(states: StatePool, slabs: Slabs, p: wp.int32):
+def has_mean_slabs(states: StatePool, slabs: Slabs, p: wp.int32):
     """Return whether there are slabs of both objects of a pair."""
     own = slabs.states[p]
     return is_made(states, slabs, own[0]) and is_made(states, slabs, own[1])
@@ -247,7 +247,7 @@ def make_due(
     states: StatePool,
     slabs: Slabs,
 ):
-    """Make the slabs of the states that are listed: every so manieth subtree, and what is above them where they end.
+    """Make the listed states' slabs: each block builds every `step`-th subtree, the last to finish the levels above.
 
     Subtrees are shared among blocks; the block that ends the last one of a state makes what is above.
     """
@@ -269,7 +269,7 @@ def make_due(
                 slabs.ended[state] = 0
 
 
-@wp.kernel(module="unique", module_options=MODULE_OPTIONS | {"block_dim": THREADS})
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS | {"block_dim": SLAB_THREADS})
 def make_slabs_kernel(threads: wp.int32, blocks: wp.int32, models: ModelPool, states: StatePool, slabs_inout: Slabs):
     """Make the slabs that are due."""
     i = wp.tid()

@@ -9,28 +9,28 @@ from warp_abtree.kernels.search.item import four_items
 
 OPEN_START = native.constant("NEAREST_OPEN_START")
 OPEN_LENGTH = native.constant("NEAREST_OPEN_LENGTH")
-stack_code = functools.partial(native.body, "search/nearest_stack.cuh")
+nearest_stack_code = functools.partial(native.body, "search/nearest_stack.cuh")
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
-@wp.func_native(stack_code("nearest_stack"))
+@wp.func_native(nearest_stack_code("nearest_stack"))
 def nearest_stack() -> wp.uint64:
-    """Return where this warp's lists lie, an address in shared memory on CUDA, and behind them a bound for each entry.
+    """Return the address of this warp's lists, in shared memory on CUDA, each entry's bound behind them.
 
     Node pairs, face pairs for float32, and face pairs for float64.
     """
 
 
-@wp.func_native(stack_code("read_bound"))
+@wp.func_native(nearest_stack_code("read_bound"))
 def read_bound(items: wp.uint64, i: wp.int32) -> wp.float32: ...
 
 
-@wp.func_native(stack_code("write_bound"))
+@wp.func_native(nearest_stack_code("write_bound"))
 def write_bound(items: wp.uint64, i: wp.int32, bound: wp.float32): ...
 
 
-@wp.func_native(stack_code("push_nearest"))
+@wp.func_native(nearest_stack_code("push_nearest"))
 def push_nearest(
     items: wp.uint64, end: wp.int32, leaf_end: wp.int32, kinds: wp.vec4i, children: four_items, bounds: wp.vec4
 ) -> wp.int64:
@@ -40,6 +40,6 @@ def push_nearest(
     """
 
 
-@wp.func_native(stack_code("push_open"))
+@wp.func_native(nearest_stack_code("push_open"))
 def push_open(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64, bound: wp.float32) -> wp.int32:
     """Append the face pairs whose flag is set to those for float64; return the new end."""

@@ -1,4 +1,4 @@
-"""Whether slabs separate two nodes of few faces, whose boxes overlap.
+"""Separating axis test by slabs (k-DOPs) of two nodes of few faces, whose boxes overlap.
 
 Boxes of faces that look aside reach beyond the surface, so that those of nested surfaces overlap all over. A slab says
 how far the faces below a node reach along the direction in which they are thinnest. Along either node's direction n the
@@ -28,7 +28,7 @@ MARGINS = wp.constant(wp.float32(2.0**18))
 
 
 @wp.struct
-class Slab:
+class NodeSlab:
     """A slab along a direction: |2 n . x - sum| <= size for all x below the node, about the model's centre."""
 
     direction: wp.vec3  # n, whole numbers, about 2^14 long
@@ -42,10 +42,10 @@ def unpack_component(bits: wp.int32):
 
 
 @wp.func
-def load_slab(models: ModelPool, at: wp.int32):
+def load_node_slab(models: ModelPool, at: wp.int32):
     record = load_constant(models.node_slab, wp.int64(at))
     low = wp.cast(record[0], wp.int32)
-    slab = Slab()
+    slab = NodeSlab()
     slab.direction = wp.vec3(
         unpack_component(low & 0xFFFF),
         unpack_component((low >> 16) & 0xFFFF),
@@ -69,8 +69,8 @@ def take_multiple(x: wp.vec3, factor: wp.float32, y: wp.vec3):
 
 @wp.func
 def overlaps_along(
-    along: Slab,
-    other: Slab,
+    along: NodeSlab,
+    other: NodeSlab,
     there: wp.vec3,
     shift: wp.vec3,
     sum: wp.vec3,
@@ -78,7 +78,7 @@ def overlaps_along(
     ratio: wp.float32,
     margin: wp.float32,
 ):
-    """Return False only where a slab lies apart from a node, along the slab's direction.
+    """Return False only where a slab separates from a node along the slab's direction.
 
     Args:
         there: The direction in the other frame.
@@ -96,7 +96,7 @@ def overlaps_along(
 
 @wp.func
 def slabs_overlap(models: ModelPool, states: StatePool, pose: PairPose, item: wp.int64):
-    """Return False only where the slabs of the two nodes that an item goes down from separate them."""
+    """Return False only where the slabs of an item's two nodes separate them."""
     x = item_first(item)
     y = item_second(item)
     # Children are named by the first of them.
@@ -104,8 +104,8 @@ def slabs_overlap(models: ModelPool, states: StatePool, pose: PairPose, item: wp
     y = wp.where(y < 0, (y & INDEX_MASK) >> 1, y)
     node_a = load_constant_node(states, pose.node_a + x)
     node_b = load_constant_node(states, pose.node_b + y)
-    a = load_slab(models, pose.slab[0] + x)
-    b = load_slab(models, pose.slab[1] + y)
+    a = load_node_slab(models, pose.slab[0] + x)
+    b = load_node_slab(models, pose.slab[1] + y)
     zero = wp.vec3()
     a_there = map_point(wp.transpose(pose.rotation32), zero, a.direction)
     b_there = map_point(pose.rotation32, zero, b.direction)

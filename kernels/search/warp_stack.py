@@ -17,23 +17,23 @@ STRADDLING_START = native.constant("STRADDLING_START")
 SLAB_PAIR_START, SLAB_PAIR_LENGTH = native.constant("SLAB_PAIR_START"), native.constant("SLAB_PAIR_LENGTH")
 
 
-stack_code = functools.partial(native.body, "search/warp_stack.cuh")
+warp_stack_code = functools.partial(native.body, "search/warp_stack.cuh")
 
 
-@wp.func_native(stack_code("warp_stack"))
+@wp.func_native(warp_stack_code("warp_stack"))
 def warp_stack() -> wp.uint64:
-    """Return where this warp's items lie, an address in shared memory on CUDA.
+    """Return the address of this warp's items, in shared memory on CUDA.
 
     Its stack, its leaf pairs, those that straddle each other's planes, the signs of these, half an item each, and its
     slab pairs.
     """
 
 
-@wp.func_native(stack_code("read_item"))
+@wp.func_native(warp_stack_code("read_item"))
 def read_item(items: wp.uint64, i: wp.int32) -> wp.int64: ...
 
 
-@wp.func_native(stack_code("write_item"))
+@wp.func_native(warp_stack_code("write_item"))
 def write_item(items: wp.uint64, i: wp.int32, item: wp.int64): ...
 
 
@@ -45,31 +45,31 @@ def push_children(items: wp.uint64, ends: wp.vec3i, lists: wp.vec4i, children: f
     """
 
 
-@wp.func_native(stack_code("push_items"))
+@wp.func_native(warp_stack_code("push_items"))
 def push_items(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64) -> wp.int32:
     """Append the items whose flag is set to the stack; return its new end."""
 
 
-@wp.func_native(stack_code("push_straddling"))
+@wp.func_native(warp_stack_code("push_straddling"))
 def push_straddling(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64, signs: wp.int32) -> wp.int32:
     """Append the leaf pairs whose flag is set, with their signs, to the straddling pairs; return the new end."""
 
 
-@wp.func_native(stack_code("read_signs"))
+@wp.func_native(warp_stack_code("read_signs"))
 def read_signs(items: wp.uint64, i: wp.int32) -> wp.int32:
     """Return the signs of the i-th straddling pair."""
 
 
-@wp.func_native(stack_code("signed_pairs"))
+@wp.func_native(warp_stack_code("signed_pairs"))
 def signed_pairs() -> wp.uint64:
-    """Return where this warp holds face pairs with their signs, an address in shared memory on CUDA."""
+    """Return the address of this warp's face pairs with their signs, in shared memory on CUDA."""
 
 
-@wp.func_native(stack_code("push_signed_pair"))
+@wp.func_native(warp_stack_code("push_signed_pair"))
 def push_signed_pair(list: wp.uint64, end: wp.int32, flag: bool, item: wp.vec3i, signs: wp.int32) -> wp.int32:
     """Append the face pairs whose flag is set, with their signs, to a list; return the new end."""
 
 
-@wp.func_native(stack_code("read_signed_pair"))
+@wp.func_native(warp_stack_code("read_signed_pair"))
 def read_signed_pair(list: wp.uint64, i: wp.int32) -> wp.vec4i:
     """Return the i-th face pair of a list, and its signs."""

@@ -1,4 +1,4 @@
-"""Proof that two posed surfaces are farther apart than d: conservative triangle distances, and what d must cover.
+"""Proof that two posed surfaces are farther apart than d: separating gaps of triangles, and their margins.
 
 Triangles are farther apart than d iff some vector n leaves a gap over d: min n.b - max n.a > d |n|, over the corners
 a of one and b of the other. ANY n proves it, however roughly it was found, so only the gap itself needs an error
@@ -28,7 +28,7 @@ corners_type = wp.types.matrix(shape=(3, 3), dtype=wp.float64)
 
 
 @wp.func
-def largest(x: wp.vec3d):
+def largest_coordinate(x: wp.vec3d):
     """Return the largest coordinate in magnitude."""
     return wp.max(wp.max(wp.abs(x[0]), wp.abs(x[1])), wp.abs(x[2]))
 
@@ -47,7 +47,7 @@ def clamp_unit(x: wp.float64):
 @wp.func
 def has_gap(n: wp.vec3d, a: corners_type, b: corners_type, d: wp.float64):
     """Return whether a gap over d between the corners a and b (rows) along n, to either side, is certain."""
-    m = largest(n)
+    m = largest_coordinate(n)
     if not (m > wp.float64(0.0) and m < wp.float64(wp.inf)):
         return False
     n = n / m
@@ -61,7 +61,7 @@ def has_gap(n: wp.vec3d, a: corners_type, b: corners_type, d: wp.float64):
 
 @wp.func
 def square_up(n: wp.vec3d, e: wp.vec3d, f: wp.vec3d):
-    """Return n without what it has along e and f: removes most of the rounding in a vector normal to both."""
+    """Return n less its components along e and f: removes most of the rounding in a vector normal to both."""
     f = f - divide(wp.dot(e, f), wp.dot(e, e)) * e
     n = n - divide(wp.dot(n, e), wp.dot(e, e)) * e
     return n - divide(wp.dot(n, f), wp.dot(f, f)) * f
@@ -69,7 +69,7 @@ def square_up(n: wp.vec3d, e: wp.vec3d, f: wp.vec3d):
 
 @wp.func
 def join_edges(p: wp.vec3d, e: wp.vec3d, q: wp.vec3d, f: wp.vec3d):
-    """Return where the closest points of segments p + s e and q + t f lie, and the vector from the first to the second.
+    """Return the parameters of the closest points of segments p + s e and q + t f, and the vector between them.
 
     Source: Ericson 2005, Real-time collision detection, section 5.1.9.
     """
@@ -125,7 +125,10 @@ def triangles_near(d: wp.float64, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: 
     f0 = b0 - a0
     f1 = b1 - a0
     f2 = b2 - a0
-    size = wp.max(wp.max(largest(e1), largest(e2)), wp.max(largest(f0), wp.max(largest(f1), largest(f2))))
+    size = wp.max(
+        wp.max(largest_coordinate(e1), largest_coordinate(e2)),
+        wp.max(largest_coordinate(f0), wp.max(largest_coordinate(f1), largest_coordinate(f2))),
+    )
     # The exponent without the digits is a power of two. Points in one place give 0, hence no number and no proof.
     scale = wp.float64(1.0) / wp.cast(wp.cast(size, wp.int64) & EXPONENT_BITS, wp.float64)
     a = wp.matrix_from_rows(zero, e1 * scale, e2 * scale)
@@ -140,7 +143,7 @@ def triangles_near(d: wp.float64, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: 
 
 @wp.func
 def skew_of(r: wp.mat33d):
-    """Return how far a matrix is from orthonormal: the largest entry of R^T R - 1."""
+    """Return the largest entry of |R^T R - 1|, by which a matrix is off orthonormal."""
     skew = wp.float64(0.0)
     for i in range(3):
         for j in range(3):
@@ -166,9 +169,9 @@ def pad_distance(models: ModelPool, states: StatePool, objects: ObjectPool, a: w
     root_b = load_node(states, states.node_start[state_b] + 1)
     reach_a = reach_box(root_a.lower, root_a.upper)
     reach_b = reach_box(root_b.lower, root_b.upper)
-    reach_a = reach_a + largest(models.centre[states.model[state_a]])
-    reach_b = reach_b + largest(models.centre[states.model[state_b]])
-    shift = largest(objects.position[b] - objects.position[a])
+    reach_a = reach_a + largest_coordinate(models.centre[states.model[state_a]])
+    reach_b = reach_b + largest_coordinate(models.centre[states.model[state_b]])
+    shift = largest_coordinate(objects.position[b] - objects.position[a])
     skew_a = skew_of(objects.rotation[a])
     skew_b = skew_of(objects.rotation[b])
     two = wp.float64(2.0)

@@ -1,4 +1,4 @@
-"""The first of three stages: triangle against triangle in float32, with a proven bound on the error of each sign.
+"""First of three stages: triangle against triangle in float32, with a proven bound on the error of each sign.
 
 It comes in two parts: planes separate most face pairs; only of those that straddle both planes, edges are compared.
 Source: as `intersect_triangles`.
@@ -59,7 +59,7 @@ def largest(x: wp.float32, y: wp.float32, z: wp.float32) -> wp.float32:
 
 @wp.func
 def bound_error(error: wp.float32, unit: wp.float32, u: wp.float32, v: wp.float32, w: wp.float32):
-    """Return how far a determinant can err whose rows have these sums of magnitudes."""
+    """Bound the error of a determinant whose rows have these sums of magnitudes."""
     p = u + 2.0 * error
     q = v + 2.0 * error
     r = w + 2.0 * error
@@ -119,7 +119,7 @@ def plane_signs(
 
 @wp.func
 def length_bound(error: wp.float32, unit: wp.float32, u: wp.vec3, v: wp.vec3):
-    """Return a length that the cross product of two differences of corners does not exceed; docs/exactness.md."""
+    """Bound the length of the cross product of two differences of corners; docs/exactness.md."""
     normal = cross32(u, v)
     p = sum_sizes(u) + 2.0 * error
     q = sum_sizes(v) + 2.0 * error

@@ -1,4 +1,4 @@
-"""The second of three stages: triangle against triangle in float64, with a proven bound on the error of each sign.
+"""Second of three stages: triangle against triangle in float64, with a proven bound on the error of each sign.
 
 It comes in two parts, as the first: planes, and edges of straddling pairs.
 Source: as `intersect_triangles`. `simd.simd_float64_filter` does the same for 8 pairs at a time; tests compare them.
@@ -13,7 +13,7 @@ from warp_abtree.kernels.triangle.intersect import intersect_triangles, is_one_s
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Beside the signs of `plane_signs`: no plane decides, and corners coincide.
-UNDECIDED, SHARED_CORNER = wp.constant(-2), wp.constant(1 << 12)
+PLANES_UNDECIDED, SHARED_CORNER = wp.constant(-2), wp.constant(1 << 12)
 
 
 @wp.func
@@ -49,8 +49,8 @@ def negate_sign(sign: wp.int32):
 def filter_planes(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
     """Return SEPARATED where one triangle lies on one side of the other's plane, else all signs, as `plane_signs`.
 
-    UNDECIDED where a sign is uncertain, or a plane is shared or not defined, and SHARED_CORNER where such triangles
-    have a corner in common, as the faces of coincident meshes do.
+    PLANES_UNDECIDED where a sign is uncertain, or a plane is shared or not defined, and SHARED_CORNER where such
+    triangles have a corner in common, as the faces of coincident meshes do.
     """
     # `orient3d` for corners of A over B. From B to A the differences are the same with the other sign, so every
     # rounding is the same.
@@ -66,7 +66,7 @@ def filter_planes(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp
     uncertain = wp.max(wp.max(sa0, wp.max(sa1, sa2)), wp.max(sb0, wp.max(sb1, sb2))) == UNCERTAIN
     if uncertain or (sa0 == 0 and sa1 == 0 and sa2 == 0) or (sb0 == 0 and sb1 == 0 and sb2 == 0):
         shared = is_zero(d00) or is_zero(d01) or is_zero(d02) or is_zero(d10) or is_zero(d11) or is_zero(d12)
-        return wp.where(shared or is_zero(d20) or is_zero(d21) or is_zero(d22), SHARED_CORNER, UNDECIDED)
+        return wp.where(shared or is_zero(d20) or is_zero(d21) or is_zero(d22), SHARED_CORNER, PLANES_UNDECIDED)
     return (pack_signs(sa0, sa1, sa2) << 6) | pack_signs(sb0, sb1, sb2)
 
 
@@ -85,7 +85,7 @@ def float64_filter_triangles(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.ve
     signs = filter_planes(a0, a1, a2, b0, b1, b2)
     if signs == SEPARATED:
         return 0
-    if signs == UNDECIDED:
+    if signs == PLANES_UNDECIDED:
         return UNCERTAIN
     if signs == SHARED_CORNER:
         return 1

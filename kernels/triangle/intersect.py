@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.func
 def find_alone(s0: wp.int32, s1: wp.int32, s2: wp.int32):
-    """Return which corner of a triangle that crosses or touches a plane is alone on its closed side, and that side.
+    """Return the corner of a triangle that is alone on its closed side of a plane it crosses or touches, and that side.
 
     The others lie on the other closed side. Where one corner touches and two lie on one side, it is alone on the other.
     """

@@ -67,7 +67,7 @@ def plain_area(k: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 @wp.func
 def filter_normal(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """Return `face_normal`, and whether it is sure of it."""
+    """Return `face_normal`, and whether it is certain."""
     x, pending0 = plain_area(0, a, b, c)
     y, pending1 = plain_area(1, a, b, c)
     z, pending2 = plain_area(2, a, b, c)
@@ -89,7 +89,7 @@ def order_ends(p1: wp.vec3d, e1: wp.vec3d, p2: wp.vec3d, e2: wp.vec3d):
 
 @wp.func
 def filter_segment(proven: bool, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
-    """Return the ends of `cross_planes`, and whether it is sure of them; `proven` that the triangles intersect.
+    """Return the ends of `cross_planes`, and whether they are certain; `proven` that the triangles intersect.
 
     Source: as `cross_planes`, whose names these are.
     """

@@ -30,7 +30,7 @@ longer than 4 L.
 import warp as wp
 
 from warp_abtree.kernels.exact.expansion import fuse_multiply
-from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, clamp_unit, divide, largest
+from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, clamp_unit, divide, largest_coordinate
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -42,7 +42,7 @@ CORNERS_OF_B, CORNERS_OF_A = wp.constant(9), wp.constant(12)
 
 @wp.struct
 class Features:
-    """Which points of two triangles are nearest."""
+    """Features of two triangles that are nearest: edges, or a corner and a face."""
 
     square: wp.float64  # their distance, squared, in the scale of the pair
     kind: wp.int32  # candidate
@@ -70,7 +70,10 @@ def scale_triangles(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: 
     t.b0 = b0 - a0
     t.b1 = b1 - a0
     t.b2 = b2 - a0
-    size = wp.max(wp.max(largest(t.a1), largest(t.a2)), wp.max(largest(t.b0), wp.max(largest(t.b1), largest(t.b2))))
+    size = wp.max(
+        wp.max(largest_coordinate(t.a1), largest_coordinate(t.a2)),
+        wp.max(largest_coordinate(t.b0), wp.max(largest_coordinate(t.b1), largest_coordinate(t.b2))),
+    )
     # The exponent without the digits; 1 where all points are in one place.
     power = wp.cast(wp.cast(size, wp.int64) & EXPONENT_BITS, wp.float64)
     t.size = wp.where(power > wp.float64(0.0), power, wp.float64(1.0))

@@ -15,7 +15,7 @@ from warp_abtree.kernels.update.refine import refine_face
 from warp_abtree.kernels.update.refit import refit_inner, refit_leaf, unite_nodes
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
 
-THREADS = 1024  # of a block, where there are few states or deep trees
+BLOCK_THREADS = 1024  # of a block, where there are few states or deep trees
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -25,14 +25,14 @@ MARK_WORDS = native.constant("MARK_WORDS")
 # Marks follow two words that count faces changed and nodes marked: a bit a node, deformed; then another a node, set
 # while two deformed children are to come.
 MARK_START = wp.constant(native.constant("MARK_START"))
-CHANGED, MARKED = wp.constant(0), wp.constant(1)
+CHANGED_COUNT, MARKED_COUNT = wp.constant(0), wp.constant(1)
 
 marks_code = functools.partial(native.body, "update/block_marks.cuh")
 
 
 @wp.func_native(marks_code("block_marks"))
 def block_marks(scratch: wp.array(dtype=wp.uint32)) -> wp.uint64:
-    """Return where this block's marks lie: an address in shared memory on CUDA, on the CPU that of `scratch`."""
+    """Return the address of this block's marks: in shared memory on CUDA, on the CPU that of `scratch`."""
 
 
 @wp.func_native(marks_code("shallow_marks"))
@@ -64,7 +64,7 @@ def unmark_bit(marks: wp.uint64, bit: wp.int32) -> bool:
 
 @wp.func_native(marks_code("fetch_entry"))
 def fetch_entry(values: wp.array(dtype=wp.vec4), i: wp.int64):
-    """Bring an entry near, so that a later load of it takes less time."""
+    """Prefetch an entry."""
 
 
 @wp.func_native(marks_code("fetch_corner"))
@@ -128,13 +128,13 @@ def mark_slice(own: BlockThread, models: ModelPool, states: StatePool, slice: wp
             changed += 1
         entry += own.threads
     if changed > 0:
-        add_to_word(own.marks, CHANGED, changed)
-        add_to_word(own.marks, MARKED, marked)
+        add_to_word(own.marks, CHANGED_COUNT, changed)
+        add_to_word(own.marks, MARKED_COUNT, marked)
 
 
 @wp.func
 def refit_ancestors(own: BlockThread, states: StatePool, leaf: wp.int32, record: Node):
-    """Refit the ancestors of a leaf up to the first that waits for another child: who comes second goes on.
+    """Last-arriver refit of a leaf's ancestors: the second thread to reach a node continues upwards.
 
     Source: Liu et al. 2006, section 3.2.2, ACTIVE-REFIT.
     """
@@ -152,7 +152,7 @@ def refit_ancestors(own: BlockThread, states: StatePool, leaf: wp.int32, record:
 
 @wp.func
 def refit_slice(own: BlockThread, models: ModelPool, states: StatePool, slice: wp.vec2i):
-    """Refine each face of a slice, once, and refit its leaf and what is above."""
+    """Refine each face of a slice, once, and refit its leaf and the ancestors."""
     entry = own.thread
     while entry < slice[1]:
         face = models.split_face[slice[0] + entry]
@@ -180,7 +180,7 @@ def refine_whole(own: BlockThread, models: ModelPool, states: StatePool, face_co
         refit_leaf(models, states, own.state, models.leaf_node[own.face_start + face], face, new)
         face += own.threads
     if changed > 0:
-        add_to_word(own.marks, CHANGED, changed)
+        add_to_word(own.marks, CHANGED_COUNT, changed)
 
 
 @wp.func
@@ -202,7 +202,7 @@ def refit_subtree(own: BlockThread, models: ModelPool, states: StatePool, height
 
 
 @wp.func
-def refit_level(own: BlockThread, models: ModelPool, states: StatePool, level: wp.int32):
+def refit_block_level(own: BlockThread, models: ModelPool, states: StatePool, level: wp.int32):
     """Refit the inner nodes of a level, one a thread at most."""
     node = (1 << level) + own.thread
     if node < 2 << level and models.node_face[models.node_start[states.model[own.state]] + node] < 0:
@@ -225,7 +225,7 @@ def update_whole(own: BlockThread, models: ModelPool, states: StatePool):
     while top > 0:
         block_sync()
         top -= 1
-        refit_level(own, models, states, top)
+        refit_block_level(own, models, states, top)
 
 
 @functools.cache
@@ -233,7 +233,7 @@ def state_update(shallow: bool):
     """Return the kernel that brings states to their LODs, for trees of SHALLOW_DEPTH or of BLOCK_DEPTH at most."""
     find_marks = shallow_marks if shallow else block_marks
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS | {"block_dim": THREADS}, cuda_max_registers=64)
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS | {"block_dim": BLOCK_THREADS}, cuda_max_registers=64)
     def update_state_kernel(
         blocks: wp.int32,
         threads: wp.int32,
@@ -270,8 +270,8 @@ def state_update(shallow: bool):
                 refit_slice(own, models, states_inout, slice)
             block_sync()
             if thread == 0:
-                marked = wp.int32(read_word(own.marks, MARKED))
-                plan_inout.changed_count[own.state] = wp.int32(read_word(own.marks, CHANGED))
+                marked = wp.int32(read_word(own.marks, MARKED_COUNT))
+                plan_inout.changed_count[own.state] = wp.int32(read_word(own.marks, CHANGED_COUNT))
                 plan_inout.marked_count[own.state] = wp.where(
                     slice[1] == WHOLE, 2 * models.face_count[model] - 1, marked
                 )

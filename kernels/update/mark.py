@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-def find_depth(node: wp.int32):
+def node_depth(node: wp.int32):
     """Return the depth of a heap index: the position of its highest bit."""
     x = node
     depth = wp.int32(0)
@@ -24,7 +24,7 @@ def mark_path(leaf: wp.int32, state: wp.int32, states: StatePool, plan: UpdateLi
     """Mark a leaf and its ancestors as far as no earlier walk has marked them; return how many there were."""
     node_start = states.node_start[state]
     node = leaf
-    depth = find_depth(node)
+    depth = node_depth(node)
     marked = wp.int32(0)
     while node > 0:
         at = node_start + node

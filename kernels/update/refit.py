@@ -73,7 +73,7 @@ def refit_node(models: ModelPool, states: StatePool, state: wp.int32, node: wp.i
 def refit_level(
     first: wp.int32, step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdateLists, states: StatePool
 ):
-    """Refit every so many-th of a level's nodes: those marked, and all of the states under full update.
+    """Refit every `step`-th of a level's nodes: those marked, and all of the states under full update.
 
     Invariant: children of this level are final, since levels go deepest first.
     Source: Liu et al. 2006, section 3.2.2, ACTIVE-REFIT; Algorithm 3.
@@ -100,14 +100,14 @@ def refit_level(
 
 @wp.kernel
 def refit_level_kernel(step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdateLists, states_inout: StatePool):
-    """Refit what an update asks for on one level."""
+    """Refit the nodes of one level that an update lists."""
     refit_level(wp.tid(), step, level, models, plan, states_inout)
 
 
 # A module of its own: its blocks are larger, and a module is compiled for every size of blocks that it is launched in.
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS | {"block_dim": TOP_THREADS})
 def refit_top_kernel(step: wp.int32, levels: wp.int32, models: ModelPool, plan: UpdateLists, states_inout: StatePool):
-    """Refit what an update asks for on so many levels from the root on, deepest first: one block for all of them."""
+    """Refit the listed nodes of so many levels from the root on, deepest first: one block for all of them."""
     level = levels - 1
     while level >= 0:
         refit_level(wp.tid(), step, level, models, plan, states_inout)

@@ -1,4 +1,4 @@
-"""What an update of many tree states works through: made by the host, or by a kernel inside a captured graph.
+"""Worklists of an update of many tree states, made by the host, or by a kernel inside a captured graph.
 
 Every count stands in device memory, so that a launch need not know it: threads take items first + step tid until there
 are none left.
@@ -22,7 +22,7 @@ WHOLE = wp.constant(-1)
 
 @wp.struct
 class UpdateLists:
-    """States under update: those that refit what a slice of faces touches (partial), and those refitted whole (full).
+    """States under update: partial, refitted where a slice of faces touches them, and full, refitted whole.
 
     A block updates a state by itself (`block_update`), or all threads work through lists, level by level. A total holds
     two counts in one word, so that one atomic takes an update's place and its items' places:
@@ -54,7 +54,7 @@ class UpdateLists:
 
 @wp.struct
 class SplitTable:
-    """Where the slices of each model lie."""
+    """Slices of each model's faces by vertex split, and the longest that each kind of update takes."""
 
     bound: wp.array(dtype=wp.int32)  # split_start of every model, as places in the pool's split_face
     bound_start: wp.array(dtype=wp.int32)  # where a model's begin in `bound`, shape [model]
@@ -130,7 +130,7 @@ def list_full(plan: UpdateLists, state: wp.int32, face_count: wp.int32, depth: w
 
 @wp.func
 def note_fault(faults: wp.array(dtype=wp.int32), i: wp.int32):
-    """Count a wish that cannot be met, and keep the lowest index that had one."""
+    """Count a request that cannot be met, and keep the lowest index that had one."""
     wp.atomic_add(faults, 0, 1)
     wp.atomic_min(faults, 1, i)
 

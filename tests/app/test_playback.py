@@ -8,7 +8,7 @@ from helpers.viewer import BODIES, make_models, make_playback, write_scene
 
 import warp_abtree as ab
 from warp_abtree.app import load_scene
-from warp_abtree.app.open_playback import lay_out, open_playback
+from warp_abtree.app.open_playback import open_playback, row_poses
 from warp_abtree.app.playback import ScenePlayback
 
 
@@ -78,7 +78,7 @@ def test_rigid_bodies_are_shown_where_they_stand(tmp_path, device):
 def test_meshes_side_by_side_reach_into_each_other():
     ball, ring = make_models()
     boxes = []
-    for model, pose in zip((ball, ring, ball), lay_out([ball, ring, ball])):
+    for model, pose in zip((ball, ring, ball), row_poses([ball, ring, ball])):
         vertices = model.mesh_at(model.lod_max)[0] + pose[:3]
         boxes.append((vertices.min(axis=0), vertices.max(axis=0)))
     for (_, upper), (lower, _) in itertools.pairwise(boxes):

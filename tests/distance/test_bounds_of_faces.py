@@ -11,7 +11,7 @@ import warp_abtree as ab
 from warp_abtree import testing
 from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.base.poses import PairPose
-from warp_abtree.kernels.distance.frame import make_frame, slack_of
+from warp_abtree.kernels.distance.frame import make_scale, slack_of
 from warp_abtree.kernels.triangle.distance_bounds import bound_faces, three_points
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -89,7 +89,7 @@ def slack_kernel(
     slack_out: wp.array2d(dtype=wp.float64),
 ):
     i = wp.tid()
-    frame = make_frame(models, states, objects, pair_poses[i], pairs[i][0], pairs[i][1])
+    frame = make_scale(models, states, objects, pair_poses[i], pairs[i][0], pairs[i][1])
     for k in range(distances.shape[1]):
         slack_out[i, k] = slack_of(frame, distances[i, k])
 

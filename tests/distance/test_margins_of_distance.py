@@ -12,7 +12,7 @@ from warp_abtree import testing
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.poses import ROUNDING_32
 from warp_abtree.kernels.distance.frame import PAIRS_LEAST
-from warp_abtree.kernels.distance.slab_bound import MARGINS
+from warp_abtree.kernels.distance.slab_bound import BOUND_MARGINS
 
 STILL = (0, 0, 0, 0, 0, 0, 1)
 ANSWERS = ("distance", "bracket", "points", "point_faces")
@@ -217,6 +217,6 @@ def test_margins_of_slabs_cover_roundings_that_add_up(device, case):
 def test_slabs_leave_off_what_roundings_add_up_to():
     """Those of docs/exactness.md, in u of the reaches of A and of B and of the translation, along n and across it."""
     along, across = (17.6, 26.9, 8.3), (25, 37, 27)
-    room = float(MARGINS) / 2 * float(ROUNDING_32) / 2.0**-24
-    assert room >= max(*along, *across) and int(MARGINS) == native.constant("SLAB_MARGINS")
-    assert "boxes.margin = SLAB_MARGINS * frame.margin;" in native.body("distance/search.h", "search_nearest")
+    room = float(BOUND_MARGINS) / 2 * float(ROUNDING_32) / 2.0**-24
+    assert room >= max(*along, *across) and int(BOUND_MARGINS) == native.constant("SLAB_MARGINS")
+    assert "boxes.margin = SLAB_MARGINS * scaling.margin;" in native.body("distance/search.h", "search_nearest")

@@ -1,4 +1,4 @@
-"""What exact answers imply: they follow the geometry, and nothing else, under every change that keeps or maps it."""
+"""Invariances of exact answers: they follow the geometry alone, under every change that keeps or maps it."""
 
 from functools import cache
 

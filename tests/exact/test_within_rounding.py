@@ -1,4 +1,4 @@
-"""What a proof of distance allows for: its own rounding, poses that round, and frames that are not orthonormal.
+"""Margins of a proof of distance: its own rounding, poses that round, and frames that are not orthonormal.
 
 Each case names two points, one of either surface: no pair is farther apart than the least float64 over their distance.
 """

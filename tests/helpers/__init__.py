@@ -1,1 +1,1 @@
-"""What tests of several packages make and ask."""
+"""Helpers of tests of several packages."""

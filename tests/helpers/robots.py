@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from warp_abtree.interop.robot.description import Description, Frame, Part
+from warp_abtree.interop.robot.description import Description, Part, RobotFrame
 from warp_abtree.model.mesh import mesh_from_arrays
 
 LIMITS = ((-20.0, 20.0), (-2.8, 2.8), (0.0, 0.1), (-2.5, 2.5))
@@ -80,13 +80,13 @@ def described_arm() -> Description:
 
     axis = np.array([0.0, 1.0, 0.2]) / np.hypot(1.0, 0.2)
     frames = [
-        Frame(-1, np.eye(4)),
-        Frame(0, placed(0, 0, 0.1), "revolute", (0, 0, 1), "turn"),
-        Frame(1, placed(0, 0.01, 0.5, 0.3, -0.2, 0.7), "revolute", tuple(axis), "bend"),
-        Frame(2, placed(0, 0, 0.42, 0, 0, 1)),
-        Frame(3, placed(0, 0, 0.05), "prismatic", (0, 1, 0), "grip"),
-        Frame(3, placed(0, 0, 0.05), "prismatic", (0, 1, 0), "grip", -1.0, -0.04),
-        Frame(2, placed(0.05, 0, 0.2), "revolute", (0, 1, 0), "swing"),
+        RobotFrame(-1, np.eye(4)),
+        RobotFrame(0, placed(0, 0, 0.1), "revolute", (0, 0, 1), "turn"),
+        RobotFrame(1, placed(0, 0.01, 0.5, 0.3, -0.2, 0.7), "revolute", tuple(axis), "bend"),
+        RobotFrame(2, placed(0, 0, 0.42, 0, 0, 1)),
+        RobotFrame(3, placed(0, 0, 0.05), "prismatic", (0, 1, 0), "grip"),
+        RobotFrame(3, placed(0, 0, 0.05), "prismatic", (0, 1, 0), "grip", -1.0, -0.04),
+        RobotFrame(2, placed(0.05, 0, 0.2), "revolute", (0, 1, 0), "swing"),
     ]
     make, names = trimesh.creation, ("base", "upper", "fore", "flange", "left", "right", "flap")
     parts = [
@@ -103,11 +103,11 @@ def described_arm() -> Description:
 
 def described_chain(mesh, *joints) -> Description:
     """Return links in a row and a mesh on the last: joints are (kind, axis, place, scale), of a value each."""
-    frames = [Frame(-1, np.eye(4))]
+    frames = [RobotFrame(-1, np.eye(4))]
     for k, (kind, axis, place, scale) in enumerate(joints):
         origin = np.eye(4)
         origin[:3, 3] = place
-        frames.append(Frame(k, origin, kind, axis, None if kind == "fixed" else f"joint {k}", scale))
+        frames.append(RobotFrame(k, origin, kind, axis, None if kind == "fixed" else f"joint {k}", scale))
     limits = {frame.joint: (-np.inf, np.inf) for frame in frames if frame.joint is not None}
     part = Part(len(joints), mesh_from_arrays(mesh.vertices, mesh.faces, name="last"))
     return Description(frames, limits, {f"link {k}": k for k in range(len(frames))}, [part])

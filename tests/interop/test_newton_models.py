@@ -1,4 +1,4 @@
-"""What `NewtonContacts` takes over from Newton's models: pairs, materials, particles, worlds; captures and order."""
+"""Newton's models in `NewtonContacts`: pairs, materials, particles, worlds; captures and order."""
 
 import numpy as np
 import pytest

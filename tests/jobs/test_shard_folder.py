@@ -155,7 +155,7 @@ def test_shards_of_every_output_and_file_hold_the_same(tmp_path, output):
         assert rows == [20, 20, 10] if output in ("any", "count") else rows[1] == 0 < min(rows[0], rows[2])
         assert run(job, tmp_path / file, file)["kept"] == 3
         found[file] = read(tmp_path / file)
-        assert not set(shard_folder.STAMP) & set(found[file])
+        assert not set(shard_folder.STAMP_FIELDS) & set(found[file])
     table = found.get("parquet", {})
     if table and output in ("any", "count"):
         np.testing.assert_array_equal(table.pop("pose"), np.arange(50))

@@ -1,4 +1,4 @@
-"""What asks for first contacts: the collision manager."""
+"""Users of first contacts: the collision manager."""
 
 import numpy as np
 import pytest

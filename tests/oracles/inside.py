@@ -1,4 +1,4 @@
-"""Whether a point lies inside a closed surface, in integers: along a line in general position, found by trying."""
+"""Even-odd test of a point in a closed surface, in integers: along a line in general position, found by trying."""
 
 import random
 

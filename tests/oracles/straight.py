@@ -1,4 +1,4 @@
-"""Whether features whose corners move straight ever meet: signs of polynomials at their roots, in fractions.
+"""Linear CCD of features in fractions: signs of polynomials at their roots tell whether they ever meet.
 
 Four corners meet as a corner and a face, or as two edges, only while they lie in one plane: at a root of the cubic that
 is their determinant, or at any time if that vanishes. There, signs of polynomials decide; a root is an interval that

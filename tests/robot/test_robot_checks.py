@@ -14,7 +14,7 @@ from helpers.robots import described_arm, described_chain, pose_frames, random_c
 
 import warp_abtree as ab
 from warp_abtree.interop.robot import check, robot
-from warp_abtree.interop.robot.description import Description, Frame
+from warp_abtree.interop.robot.description import Description, RobotFrame
 
 STILL = (0, 0, 0, 0, 0, 0, 1)
 RING = ab.Model.load(trimesh.creation.torus(0.45, 0.12, 32, 12))
@@ -144,7 +144,7 @@ def test_surroundings_are_a_scene_with_bits_lods_and_solids(arm, device):
 def test_chunks_and_small_buffers_change_nothing(arm, monkeypatch):
     rows = random_configurations(50, seed=4)
     whole = [arm.check(rows, AROUND, output=output) for output in ("any", "distance")]
-    monkeypatch.setattr(robot, "CHUNKS", {"cpu": (7,), "cuda": (7,)})
+    monkeypatch.setattr(robot, "ROOMS", {"cpu": (7,), "cuda": (7,)})
     monkeypatch.setattr(check, "PAIRS_GUESS", 0)
     for output, expected in zip(("any", "distance"), whole):
         np.testing.assert_array_equal(arm.check(rows, AROUND, output=output), expected)
@@ -270,10 +270,10 @@ def test_a_robot_without_joints_is_asked_like_any_other(device):
 def test_a_mounted_link_without_a_mesh_takes_those_fixed_to_it(device):
     """A world, a base without a mesh, two plates fixed to it, and what turns on them; a frame that turns alone."""
     description = described_arm()
-    fixed = [Frame(-1, np.eye(4)), Frame(0, np.eye(4))]
+    fixed = [RobotFrame(-1, np.eye(4)), RobotFrame(0, np.eye(4))]
     frames = [*fixed, *[replace(f, parent=f.parent + 2 if f.parent >= 0 else 1) for f in description.frames]]
     names = {"world": 0, "stand": 1, **{name: k + 2 for name, k in description.links.items()}, "eye": len(frames)}
-    frames.append(Frame(len(frames) - 1, np.eye(4), "revolute", (0, 0, 1), "turn"))
+    frames.append(RobotFrame(len(frames) - 1, np.eye(4), "revolute", (0, 0, 1), "turn"))
     order = list(names)
     parts = [replace(part, link=order.index(list(description.links)[part.link])) for part in description.parts]
     parts.append(replace(parts[0], link=order.index("stand")))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import warp_abtree as ab
 from warp_abtree.interop.robot import check, robot
-from warp_abtree.interop.robot.description import Frame, Part
+from warp_abtree.interop.robot.description import Part, RobotFrame
 from warp_abtree.model.mesh import mesh_from_arrays
 
 RING = ab.Model.load(trimesh.creation.torus(0.45, 0.12, 32, 12))
@@ -129,7 +129,7 @@ def test_a_joint_that_mimics_backwards_meets_a_thin_wall(device, kind, scale):
 def test_parts_of_a_robot_meet_each_other_whichever_moves(device, turned):
     """A cube slides along x on two joints; thin plates are on the base, at x = 2, and on a slide of their own."""
     made = described_chain(CUBE, ("prismatic", X, HERE, 1.0), ("prismatic", Y, HERE, 1.0))
-    made.frames.append(Frame(0, np.eye(4), "prismatic", X, "plate"))
+    made.frames.append(RobotFrame(0, np.eye(4), "prismatic", X, "plate"))
     made.joints["plate"], made.links["plate"] = (-np.inf, np.inf), 3
     for link, x in ((3, 0.0), (0, 2.0)):
         plate = trimesh.creation.box((1e-4, 1, 1), trimesh.transformations.translation_matrix((x, 0, 0)))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
-from warp_abtree.interop.robot.check import ask_about
+from warp_abtree.interop.robot.check import make_link_request
 from warp_abtree.interop.robot.link_query import LinkHits
 from warp_abtree.interop.robot.surroundings import RobotBatch
 from warp_abtree.kernels.robot import forward, link_pairs
@@ -43,7 +43,7 @@ def find_reach(description, device, middle, half, size):
     """Return the reach of the only part at a configuration, and where its vertices stand there as computed."""
     robot = ab.Robot(description, device)
     batch = RobotBatch(None, robot.models, 1, robot.device)
-    links = LinkHits(batch.batch, ask_about(robot, batch, 1), 1, True).links
+    links = LinkHits(batch.batch, make_link_request(robot, batch, 1), 1, True).links
     for target, values in ((links.configurations, middle), (links.chunk.half, half), (links.chunk.size, size)):
         target.assign(np.array(values, np.float64)[None])
     links.place()

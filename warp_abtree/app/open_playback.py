@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.app.cli.arguments import Parser, positive
+from warp_abtree.app.cli.arguments import Parser, positive_count
 from warp_abtree.app.cli.model_commands import load_model, lod_at
 from warp_abtree.app.playback import MeshPlayback, Playback, ScenePlayback
 from warp_abtree.app.toml.folder import find_scene
@@ -47,7 +47,7 @@ def _open_meshes(paths, device, progress, poses, lod) -> MeshPlayback:
             known[path] = load_model(path, progress)
     models = [known[path] for path in paths]
     lods = [lod_at("--lod", model, "finest" if lod is None else lod) for model in models]
-    places = lay_out(models)
+    places = row_poses(models)
     if len(poses):
         places[1 : 1 + len(poses)] = poses
     try:
@@ -63,10 +63,10 @@ def add_playback_arguments(sub: Parser):
     about = "pose of the second mesh, again for the third; without it each stands beside the one before, a bit inside"
     sub.add_pose(about, action="append", default=[])
     sub.add_argument("--lod", metavar="LOD", help="LOD of meshes, as for query (finest)")
-    sub.add_argument("--objects", type=positive, metavar="N", help="about so many objects of a scene, as for run")
+    sub.add_argument("--objects", type=positive_count, metavar="N", help="about so many objects of a scene, as for run")
 
 
-def lay_out(models) -> np.ndarray:
+def row_poses(models) -> np.ndarray:
     """Return poses (n, 7) in a row along x, in which each model reaches a little into the one before."""
     places = np.zeros((len(models), 7))
     places[:, 6] = 1.0

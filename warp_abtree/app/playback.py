@@ -1,4 +1,4 @@
-"""What `view` and `picture` show: a scene that runs or stands, or meshes; one snapshot after another.
+"""Playbacks for `view` and `picture`: snapshots, one after another, of a scene that runs or stands, or of meshes.
 
 A playback owns its scene: one thread steps, queries and changes it.
 """
@@ -15,11 +15,11 @@ from warp_abtree.simulate.frame import Frame
 from warp_abtree.simulate.lod_request import LodSweep
 
 SWEEP_PERIOD = 8.0  # seconds from the finest LOD of a mesh to its base and back
-OWN, HOLD = "scene", "hold"  # LODs as the scene chooses them, and as they are
+OWN_MODE, HOLD_MODE = "scene", "hold"  # LODs as the scene chooses them, and as they are
 
 
 class MeshView(NamedTuple):
-    """How meshes are looked at: directions to the eye and upwards, and the world that is shown."""
+    """View of meshes: directions to the eye and upwards, and the world that is shown."""
 
     eye: tuple[float, float, float] = (0.4, 0.35, 1.0)
     up: tuple[float, float, float] = (0.0, 1.0, 0.0)
@@ -40,7 +40,7 @@ class Playback:
         self.scene, self.title, self.worlds = scene, title, np.asarray(worlds)
         self.time_step, self.view = time_step, view
         self.camera, self.control = camera, control or LodControl()
-        self._mode, self._budget = OWN, None
+        self._mode, self._budget = OWN_MODE, None
         self.restart()
 
     def _begin(self) -> tuple:
@@ -66,7 +66,11 @@ class Playback:
     def modes(self) -> list[str]:
         """Return the modes of choosing LODs, as `choose` takes them."""
         names = [name for name in CONTROLLERS if name != "none"]
-        return [OWN, HOLD, *(name for name in names if name != "tolerance" or self.control.tolerance is not None)]
+        return [
+            OWN_MODE,
+            HOLD_MODE,
+            *(name for name in names if name != "tolerance" or self.control.tolerance is not None),
+        ]
 
     def choose(self, mode, budget_ms=None):
         """Choose LODs in one of `modes`.
@@ -78,20 +82,20 @@ class Playback:
         Raises:
             ValueError: A controller without its budget, or another mode; the mode before is kept.
         """
-        if mode == HOLD:
+        if mode == HOLD_MODE:
             inner, self.chosen = None, self.scene.lods
-        elif mode == OWN and (self.control.controller == "none" or budget_ms is None):
+        elif mode == OWN_MODE and (self.control.controller == "none" or budget_ms is None):
             inner = self._own
             self.chosen = self._first if inner is None else self.chosen
         else:
-            name = self.control.controller if mode == OWN else mode
+            name = self.control.controller if mode == OWN_MODE else mode
             inner = self.control.asked(name, budget_ms).make(self.scene, self.camera)
         self._frame.lods = (lambda _: self.chosen) if inner is None else inner
         self._mode, self._budget = mode, budget_ms
 
     def hold(self, lods):
         """Hold LODs of all objects, (n,), until others are chosen."""
-        self.choose(HOLD)
+        self.choose(HOLD_MODE)
         self.chosen = np.array(lods, np.int32)
 
     @property

@@ -1,4 +1,4 @@
-"""What is drawn of a scene at one time: `compose` makes `RenderData` of a `Snapshot`, for viewer and pictures."""
+"""Render data of a scene at one time: `compose` makes `RenderData` of a `Snapshot`, for viewer and pictures."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ class Snapshot:
 
 @dataclass
 class Settings:
-    """What is shown."""
+    """Settings of what is shown."""
 
     world: int = 0  # objects of world -1 are in every one
     intersecting: bool = True  # whether intersecting faces are coloured
@@ -80,7 +80,7 @@ def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Sett
     distinct, repeats = np.unique(keys[shown], return_counts=True)
     meshes = [(*geometry.split_key(key), n) for key, n in zip(distinct.tolist(), repeats.tolist())]
     pairs = inside[result.pairs].all(axis=1) if len(result.pairs) else np.zeros(0, bool)
-    nearest, distance = geometry.nearest_points(scene, shown, result) if settings.distances else geometry.NO_NEAREST
+    nearest, distance = geometry.nearest_points(scene, shown, result) if settings.distances else geometry.NO_SEGMENTS
     return RenderData(
         poses=snapshot.poses,
         keys=keys,

@@ -12,7 +12,7 @@ from warp_abtree.scene.scene import Scene
 LIFT = 1.5e-3  # of a model's diagonal: offset of intersecting faces from the mesh, to both sides
 COARSE, FINE = np.array((0.16, 0.24, 0.60)), np.array((1.0, 0.80, 0.20))
 FEW_OBJECTS = 12  # all pairs of which have distances drawn
-NO_NEAREST = np.empty((0, 2, 3)), np.empty(0)
+NO_SEGMENTS = np.empty((0, 2, 3)), np.empty(0)
 CACHED_FACES = 4_000_000  # that a cache of meshes keeps
 
 
@@ -125,7 +125,7 @@ def nearest_points(scene: Scene, shown, result) -> tuple[np.ndarray, np.ndarray]
     else:
         pairs = result.pairs[np.isin(result.pairs, shown).all(axis=1)]
     if not len(pairs):
-        return NO_NEAREST
+        return NO_SEGMENTS
     found = scene.intersect(pairs, output="distance")
     apart = found.distance > 0
     return found.points[apart], found.distance[apart]

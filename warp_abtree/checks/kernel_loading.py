@@ -9,7 +9,7 @@ import warp as wp
 from warp_abtree.checks.cpu_threads import core_count, wait_for, workers
 
 # Threads beside the calling one: on the CPU each compiles Warp's headers for itself first.
-THREADS = {"cpu": 1, "cuda": 7}
+LOADING_THREADS = {"cpu": 1, "cuda": 7}
 # The same beside the build of a model, which keeps one core busy itself.
 AHEAD_THREADS = {"cpu": 2, "cuda": 6}
 
@@ -36,7 +36,7 @@ def loading(device, kernels, busy: int = 0):
         Exception: What the compiler says, as a launch would.
     """
     new = _new_kernels(device, kernels)
-    threads = min(THREADS["cpu" if device.is_cpu else "cuda"], core_count() - 1 - busy, len(new))
+    threads = min(LOADING_THREADS["cpu" if device.is_cpu else "cuda"], core_count() - 1 - busy, len(new))
 
     def load():
         while new:

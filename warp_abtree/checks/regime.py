@@ -1,4 +1,4 @@
-"""Which of several equivalent paths the library takes; `warp_abtree.testing` switches them, nothing else does."""
+"""Regimes, choices among equivalent code paths; `warp_abtree.testing` switches them, nothing else does."""
 
 from dataclasses import dataclass, field, replace
 

@@ -1,4 +1,4 @@
-"""What a `CollisionManager` returns for a pair of objects: contacts, and nearest points."""
+"""Records that a `CollisionManager` returns for a pair of objects: contacts, and nearest points."""
 
 import numpy as np
 

@@ -28,7 +28,7 @@ from warp_abtree.scene.scene import Scene
 # Pairs of other shapes that there is room for by default.
 OTHERS_MAX = 2**16
 SETTINGS = ("scale", "margin", "gap", "flags", "collision_group", "world", "body")
-FIELDS = ("shape0", "shape1", "point0", "point1", "offset0", "offset1", "normal", "margin0", "margin1")
+CONTACT_FIELDS = ("shape0", "shape1", "point0", "point1", "offset0", "offset1", "normal", "margin0", "margin1")
 
 
 def pairs_between(rows, others):
@@ -323,7 +323,7 @@ class NewtonContacts(DeviceMemory):
         wp.copy(self._first, contacts.rigid_contact_count, count=1)
         rigid = kernels.RigidContacts()
         rigid.count = contacts.rigid_contact_count
-        for name in FIELDS:
+        for name in CONTACT_FIELDS:
             setattr(rigid, name, getattr(contacts, f"rigid_contact_{name}"))
         query, room = self.query, len(self._count)
         body_q = self._no_body if body_q is None else body_q

@@ -8,8 +8,8 @@ from warp_abtree.model.mesh import load_mesh
 from warp_abtree.model.model import Model
 from warp_abtree.scene.scene import Scene
 
-FREE_SLOTS = 16  # without an object, kept for others of the same mesh; or as many as there are objects
-CHUNK = 2**16  # pairs whose corners are compared at a time
+FREE_SLOTS_KEPT = 16  # without an object, kept for others of the same mesh; or as many as there are objects
+PAIRS_AT_ONCE = 2**16  # pairs whose corners are compared at a time
 
 
 class Shape:
@@ -100,7 +100,7 @@ class PlacedShapes:
 
     def has_too_many_free(self, used) -> bool:
         """Return whether more slots are free than are to be kept, with so many in use."""
-        return sum(map(len, self._free.values())) > max(FREE_SLOTS, used)
+        return sum(map(len, self._free.values())) > max(FREE_SLOTS_KEPT, used)
 
     def upload(self):
         """Copy poses that have changed to the device."""
@@ -135,8 +135,8 @@ class PlacedShapes:
         """Return an upper bound on the least distance of all pairs, that of two corners, and the index of its pair."""
         corners = np.array([s.corners @ p[:3, :3].T + p[:3, 3] for s, p in zip(self.shapes, self.poses)])
         upper, likely = np.inf, 0
-        for start in range(0, len(pairs), CHUNK):
-            part = start + np.flatnonzero(gaps[start : start + CHUNK] <= upper)
+        for start in range(0, len(pairs), PAIRS_AT_ONCE):
+            part = start + np.flatnonzero(gaps[start : start + PAIRS_AT_ONCE] <= upper)
             if len(part):
                 i, j = pairs[part].T
                 apart = np.linalg.norm(corners[i, :, None] - corners[j, None], axis=-1).min((1, 2))

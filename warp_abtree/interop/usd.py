@@ -10,7 +10,7 @@ from warp_abtree.model.files.usd_mesh import read_usd_mesh
 SECTIONS, SUBDIVISIONS = 64, 4
 SHOWN = ("default", "render")  # purposes that are read
 # From a shape along z to one along another axis, cyclically, which mirrors nothing.
-ALONG = {"X": [2, 0, 1], "Y": [1, 2, 0], "Z": [0, 1, 2]}
+AXIS_COLUMNS = {"X": [2, 0, 1], "Y": [1, 2, 0], "Z": [0, 1, 2]}
 
 
 def read_usd(path, remarks):
@@ -173,7 +173,9 @@ def _make_shape(prim, time):
     vertices = np.asarray(mesh.vertices, np.float64)
     # Of USD all have their middle at the origin.
     vertices = vertices - (vertices.min(0) + vertices.max(0)) / 2
-    return vertices[:, ALONG[get("axis")] if prim.HasAttribute("axis") else ALONG["Z"]], np.asarray(mesh.faces)
+    return vertices[:, AXIS_COLUMNS[get("axis")] if prim.HasAttribute("axis") else AXIS_COLUMNS["Z"]], np.asarray(
+        mesh.faces
+    )
 
 
 def _make_plane(width, length, axis):

@@ -18,12 +18,12 @@ import numpy as np
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.checks.atomic_write import atomic_write, find_partial, is_special
 
-FORMAT_NAME, FORMAT_VERSION = "warp_abtree shards", 2
+SHARD_FORMAT, SHARD_VERSION = "warp_abtree shards", 2
 MANIFEST = "job.json"
 FILES = ("npz", "parquet")
 SHARD_NAME = re.compile(r"shard-\d{12,}-\d{12,}\.(npz|parquet)")
 WRITTEN = re.compile(rf"{re.escape(MANIFEST)}|{SHARD_NAME.pattern}")
-STAMP = ("job", "range", "digest")
+STAMP_FIELDS = ("job", "range", "digest")
 
 
 class DamagedShard(ValueError):
@@ -46,7 +46,7 @@ class ShardFolder:
             _import_parquet()
         self.path, self.unit = Path(out), job.unit
         known = json.loads(json.dumps({**job.describe(), "file": file}))
-        self.manifest = {"format": FORMAT_NAME, "version": FORMAT_VERSION, "hash": _hash_job(known), "job": known}
+        self.manifest = {"format": SHARD_FORMAT, "version": SHARD_VERSION, "hash": _hash_job(known), "job": known}
         self.left = dict.fromkeys(_ranges(known))
         self.damaged: list = []
         self.intersecting = 0
@@ -160,7 +160,7 @@ def _read_shard(path, manifest, start, stop, read=lambda name, values: values) -
     with open(path, "rb") as file:
         try:
             for name, values in open_columns(file):
-                if name in STAMP:
+                if name in STAMP_FIELDS:
                     stamp[name] = str(values)
                     continue
                 _add_column(digest, name, values)
@@ -171,7 +171,7 @@ def _read_shard(path, manifest, start, stop, read=lambda name, values: values) -
             raise
         except Exception as error:  # readers raise many types on damaged data
             raise DamagedShard(f"{path}: damaged ({first_line(error)})") from None
-    if set(stamp) != set(STAMP) or stamp["digest"] != _close_digest(digest, stamp["job"], stamp["range"]):
+    if set(stamp) != set(STAMP_FIELDS) or stamp["digest"] != _close_digest(digest, stamp["job"], stamp["range"]):
         raise DamagedShard(f"{path}: damaged or altered")
     if stamp["job"] != manifest["hash"]:
         raise ValueError(f"{path}: a shard of another job")
@@ -200,7 +200,7 @@ def _read_parquet(file):
     with _import_parquet()[1].ParquetFile(file) as table:
         schema = table.schema_arrow
         for name, text in (schema.metadata or {}).items():
-            if name.decode() in STAMP:
+            if name.decode() in STAMP_FIELDS:
                 yield name.decode(), text.decode()
         for name in schema.names:
             yield name, table.read(columns=[name]).column(0).to_numpy()
@@ -287,8 +287,8 @@ def _read_manifest(path) -> dict:
         raise ValueError(f"{path}: holds no {MANIFEST}") from None
     except ValueError as error:
         raise ValueError(f"{path / MANIFEST}: damaged ({error})") from None
-    if not isinstance(held, dict) or (held.get("format"), held.get("version")) != (FORMAT_NAME, FORMAT_VERSION):
-        raise ValueError(f"{path / MANIFEST}: not of {FORMAT_NAME}, version {FORMAT_VERSION}")
+    if not isinstance(held, dict) or (held.get("format"), held.get("version")) != (SHARD_FORMAT, SHARD_VERSION):
+        raise ValueError(f"{path / MANIFEST}: not of {SHARD_FORMAT}, version {SHARD_VERSION}")
     if held.get("hash") != _hash_job(held.get("job")):
         raise ValueError(f"{path / MANIFEST}: damaged (the hash is not that of the job)")
     return held

@@ -38,7 +38,7 @@ FALLS = tuple(-round(2.0 ** (i / 2)) for i in range(21) if i not in (1, 3))
 
 @dataclass(frozen=True)
 class Feedback:
-    """What a controller is told before a frame.
+    """Feedback to a controller before a frame.
 
     Attributes:
         time: Time of the next frame [s].
@@ -60,7 +60,7 @@ class Feedback:
 
 
 class Controller(DeviceMemory):
-    """What all controllers share.
+    """Base of all controllers.
 
     Args:
         scene: `Scene` with all its objects.

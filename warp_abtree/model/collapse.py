@@ -36,7 +36,7 @@ class Collapse:
         np.divide(vertices - centre, scale, out=self.pos[: len(vertices)])
         self._merge_pair = unwritten((len(vertices), 2), wp.vec2i)
         self.pair = self._merge_pair.numpy()  # shares the memory
-        self._start_live = int(are_distinct(faces).sum())
+        self._start_live = int(distinct_corners(faces).sum())
         self.goal = max(self._start_live - base_faces, 1)
         self._state = np.zeros(4, np.int32)
         self._merges, self._removed, self._ended, self._stopped = 0, 0, False, False
@@ -124,14 +124,14 @@ def _new_heap(pairs):
     return heap
 
 
-def are_distinct(faces):
+def distinct_corners(faces):
     """Return which faces have three distinct corners."""
     return (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
 
 
 def _edges(faces):
     """Return the packed edges of the faces with three corners, ascending, and which corners start a boundary edge."""
-    valid = are_distinct(faces)
+    valid = distinct_corners(faces)
     start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
     pair = (np.minimum(start, end) << 32) | (np.maximum(start, end) << 2)
     slot = np.flatnonzero(np.repeat(valid, 3))

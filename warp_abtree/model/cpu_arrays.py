@@ -48,7 +48,7 @@ def linked_rings(faces, face_array, node_capacity):
 
 def make_scratch(candidates, faces, rows):
     """Return `polygon.Scratch` for so many candidate faces, covering faces and polygons on the stack."""
-    scratch, corners = polygon.Scratch(), int(polygon.CORNERS)
+    scratch, corners = polygon.Scratch(), int(polygon.POLYGON_CORNERS)
     scratch.near, scratch.used = unwritten(candidates), unwritten(faces)
     scratch.stack, scratch.stack_count = unwritten((rows, corners), wp.vec3d), unwritten(rows)
     scratch.polygon, scratch.clipped = unwritten((corners,), wp.vec3d), unwritten((corners,), wp.vec3d)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
+from warp_abtree.kernels.base.poses import COORDINATE_MIN
 from warp_abtree.model.files.found import MeshError, Remarks, Surface
 from warp_abtree.model.files.read import read_file, split_file_name
 from warp_abtree.model.files.usd_mesh import read_warp_asset
@@ -17,7 +18,6 @@ from warp_abtree.model.winding import component_labels, find_winding, keep_outsi
 
 FACE_LIMIT = 2**30  # int32 forest ids count up to two nodes a vertex, and heap indices up to two a face
 EXTENT_LIMITS = (2.0**-100, 2.0**100)  # boxes are float32
-COORDINATE_MIN = 2.0**-290  # smaller ones are 0
 COORDINATE_MAX = 2.0**300  # products of three stay finite
 
 
@@ -199,7 +199,7 @@ def _weld_mesh(vertices, faces, name, where):
     referenced[faces] = True
     used = np.flatnonzero(referenced)
     # Makes -0.0 equal to 0.0, and products of three coordinates free of underflow, which exact predicates require.
-    positions = np.where(np.abs(vertices[used]) < COORDINATE_MIN, 0.0, vertices[used])
+    positions = np.where(np.abs(vertices[used]) < float(COORDINATE_MIN), 0.0, vertices[used])
     first, distinct = _weld(positions)
     new_index = np.full(file_vertex_count, -1, dtype=np.int32)
     new_index[used] = distinct

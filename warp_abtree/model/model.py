@@ -13,12 +13,12 @@ import numpy as np
 
 from warp_abtree.checks.arguments import first_line, whole_number
 from warp_abtree.checks.atomic_write import atomic_write
+from warp_abtree.kernels.base.poses import COORDINATE_MIN
 from warp_abtree.model.cache import LEAST_FACES, error_key, file_key, find_model, keep_errors, keep_model, mesh_key
 from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.files.unpack import exceeds_limit, limit_message
 from warp_abtree.model.mesh import (
     COORDINATE_MAX,
-    COORDINATE_MIN,
     EXTENT_LIMITS,
     Mesh,
     load_mesh,
@@ -351,7 +351,7 @@ def _assemble(path, arrays, error_key) -> Model:
     require(m >= 0 and n_v > 0 and n_f > 0, "empty arrays")
     require(pos.shape == (n_v + m, 3) and np.isfinite(pos).all(), "'vertex_pos' has the wrong length or is not finite")
     size = np.abs(pos)
-    fits = ((size >= COORDINATE_MIN) | (size == 0)) & (size <= COORDINATE_MAX)
+    fits = ((size >= float(COORDINATE_MIN)) | (size == 0)) & (size <= COORDINATE_MAX)
     require(fits.all(), "'vertex_pos' has coordinates outside 2^-290 .. 2^300")
     require(faces.shape == (n_f, 3) and faces.min() >= 0 and faces.max() < n_v, "'face_vertex' is out of range")
     nodes = np.arange(n_v + m)

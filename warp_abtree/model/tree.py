@@ -31,11 +31,11 @@ class Tree:
     def from_leaves(cls, leaf_node: np.ndarray) -> "Tree":
         """Make the tree that an indexed list describes; raise ValueError unless every face has a leaf of its own."""
         n = len(leaf_node)
-        node_face = np.full(2 << find_depth(n), -1, np.int32)
+        node_face = np.full(2 << tree_depth(n), -1, np.int32)
         if not np.array_equal(np.sort(leaf_node), np.sort(leaf_nodes(n))):
             raise ValueError(f"the indexed list is not one leaf for each of {n} faces")
         node_face[leaf_node] = np.arange(n, dtype=np.int32)
-        return cls(leaf_node, node_face, find_depth(n))
+        return cls(leaf_node, node_face, tree_depth(n))
 
     def node_boxes(self, faces, face_lower: np.ndarray, face_upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return minima and maxima of all nodes over some faces, (node_count, 3) each, infinite where there is none."""
@@ -55,14 +55,14 @@ class Tree:
         return len(self.node_face)
 
 
-def find_depth(n: int) -> int:
+def tree_depth(n: int) -> int:
     """Return the depth of a tree of n leaves, ceil(log2 n)."""
     return (n - 1).bit_length()
 
 
 def leaf_nodes(n: int) -> np.ndarray:
     """Return the heap index of each leaf position of a tree of n leaves, int32 (n,)."""
-    depth = find_depth(n)
+    depth = tree_depth(n)
     bounds = (np.arange((1 << depth) + 1) * n) >> depth
     index = np.flatnonzero(np.diff(bounds))
     node = (1 << depth) + index
@@ -100,7 +100,7 @@ def active_build(vertex_pos: np.ndarray, face_vertex: np.ndarray) -> Tree:
     if not 0 < n <= FACE_LIMIT:
         raise ValueError(f"an AB-Tree needs 1 to 2^30 faces, not {n}")
     corners = vertex_pos[face_vertex]
-    leaf_face = _sort_leaves(corners.min(1), corners.max(1), find_depth(n))
+    leaf_face = _sort_leaves(corners.min(1), corners.max(1), tree_depth(n))
     leaf_node = np.empty(n, np.int32)
     leaf_node[leaf_face] = leaf_nodes(n)
     return Tree.from_leaves(leaf_node)

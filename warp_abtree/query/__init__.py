@@ -1,1 +1,1 @@
-"""Which object pairs and which faces intersect, and where: broad phase, narrow phase, contacts."""
+"""Queries of object pairs: broad phase, narrow phase, contacts and distances."""

@@ -1,4 +1,4 @@
-"""Launches that are recorded once and repeated while what they were given stands: a fifth of the host's time.
+"""Recorded launches, repeated while what they were given stands: a fifth of the host's time.
 
 On a GPU those of a whole call become a graph: one launch in place of seven.
 """

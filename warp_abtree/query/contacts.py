@@ -100,8 +100,8 @@ class ContactQuery(Query):
 
     Attributes:
         faces: The last launch's `Result.faces`, device vec3i (capacity,), sorted.
-        contacts: Their contacts, device arrays (capacity,) of `kernels.contact.Contacts`, float64.
-        pair_contacts: Their summaries, device arrays (pair capacity,) of `kernels.summary.PairContacts`, float64.
+        contacts: Their contacts, device arrays (capacity,) of `kernels.contacts.contact.Contacts`, float64.
+        pair_contacts: Their summaries, device arrays (pair capacity,) of `kernels.contacts.summary.PairContacts`.
         start: Where the rows of pair p start in faces and contacts, device int32 (pair capacity + 1,): they end at
             start[p + 1], and all of them at the last entry. Places behind that hold nothing.
         hits, pairs, pair_count, near: As for `Query`. Where hits.count sums to more than the capacity, contacts are
@@ -267,7 +267,7 @@ class ContactQuery(Query):
         if self._gap is not None:
             if self.uses_warps():
                 inputs = [*self.batch.pools[:2], self.pair_poses, self.start, self.faces, self.contacts]
-                self._launch_kernel(separation.find_depth_kernel, count, inputs, WARP_SIZE)
+                self._launch_kernel(separation.find_separation_kernel, count, inputs, WARP_SIZE)
             inputs = [step, *posed, self.faces, self._near, not self.uses_warps(), self.contacts]
             self._launch_kernel(separation.find_near_contact_kernel, step, inputs, WARP_SIZE)
         step = DEFERRED_WARPS * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1

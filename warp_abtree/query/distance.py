@@ -1,4 +1,4 @@
-"""How far apart two surfaces are, and where: `DistanceQuery`.
+"""Least distances of surfaces, nearest points and depths: `DistanceQuery`.
 
 The distance of an object pair is the least distance of a point of one surface, at its LOD, from a point of the other.
 It is 0 if and only if the surfaces intersect, which the exact test decides. For each pair, in the order in which it
@@ -23,10 +23,9 @@ middles of edges and centroids of faces, of both objects if both are solids. The
 * points are the point inside and the point of the other surface that is nearest to it, in the order of the pair, and
   point_faces the faces that they lie on. From the point inside to the other is its way out.
 
-Whatever the number of faces that have gone under, no shorter motion frees the objects: depth is a lower bound of the
-penetration depth, the length of the shortest motion that does, and that length for a body pressed into a flat floor or
-a peg that is too thick for its hole. Where solids cross and none of these points is inside, distance is 0. Pairs of
-which no object is a solid are refused.
+Depth is a lower bound of the penetration depth, the length of the shortest motion that frees the objects, however many
+faces are submerged, and that length for a body pressed into a flat floor or a peg that is too thick for its hole. Where
+solids cross and none of these points is inside, distance is 0. Pairs of which no object is a solid are refused.
 
 With the default tolerance, all of this is the same, bit for bit, on CPU and CUDA, whatever the search has started from.
 With a tolerance points, faces and distance may also depend on what the last launch found.
@@ -60,7 +59,7 @@ from warp_abtree.query.staging import first_rows
 PAIRS_A_CORE = 4
 NOT_BEYOND = np.array(np.inf)  # one for all, so that it is known again at once
 NOT_BEYOND.flags.writeable = False
-FIELDS = {"point_faces": "faces"}  # of `report.Distances`, where a result's name is another
+ANSWER_FIELDS = {"point_faces": "faces"}  # of `report.Distances`, where a result's name is another
 CROSSING_KERNELS = [crossing.search_crossing_kernel, crossing.report_crossing_kernel]
 
 
@@ -102,7 +101,7 @@ def check_flags(options: dict) -> tuple[bool, bool]:
 
 
 def check_asked(output, precision, options):
-    """Check what is asked of a sweep.
+    """Check the options of a sweep's query.
 
     Raises:
         TypeError: An option with another name than tolerance, relative, beyond, signed, originals and within.
@@ -125,7 +124,7 @@ def check_asked(output, precision, options):
 
 
 def prepare_query(query, batch, pairs: np.ndarray, beyond: np.ndarray, tolerances: dict, signed: bool = False):
-    """Return a `DistanceQuery` for what is asked, checked: the one of before if there is one, else another."""
+    """Return a `DistanceQuery` with these options, checked: the one of before if there is one, else another."""
     if query is None:
         return DistanceQuery(batch, pairs=pairs, beyond=beyond, signed=signed, **tolerances)
     query.set_tolerance(**tolerances)
@@ -166,7 +165,7 @@ class DistanceQuery(Query):
         self._tolerances.tolerance, self._tolerances.relative = self._asked_tolerances
         self._answer_views: tuple[int, dict] = (-1, {})
         self._asked = check_beyond(beyond, None if pairs is None else len(to_numpy(pairs, "pairs")))
-        self.distances, self._found, self._slabs = report.Distances(), frame.Found(), mean_slabs.Slabs()
+        self.distances, self._found, self._slabs = report.Distances(), frame.NearestFound(), mean_slabs.Slabs()
         self._slabs.record = wp.empty(0, dtype=wp.vec4, device=scene.device)
         self._slabs.due_count = wp.zeros(1, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity)
@@ -220,14 +219,14 @@ class DistanceQuery(Query):
         kernels += CROSSING_KERNELS if device.is_cuda else []  # on the CPU where pairs cross
         kernels += [report.report_distance_kernel, frame.start_distance_kernel] if with_warps else []
         searching = super().kernels(device, output, precision, with_gap, with_distances)
-        making = [(mean_slabs.make_slabs_kernel, mean_slabs.THREADS)] if with_warps else []
+        making = [(mean_slabs.make_slabs_kernel, mean_slabs.SLAB_THREADS)] if with_warps else []
         return [*[(kernel, WARP_SIZE) for kernel in kernels], *making, *searching]
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
         for owner, name, dtype in (
             (self._found, "distance", wp.float64),
-            (self._found, "frame", frame.Frame),
+            (self._found, "scaling", frame.SearchScale),
             (self._found, "beyond", wp.float64),
             (self.distances, "distance", wp.float64),
             (self.distances, "bracket", wp.vec2d),
@@ -338,19 +337,19 @@ class DistanceQuery(Query):
         if not self.uses_warps():
             made = []
             for steps in [(True, True)] if self._search_cores() == 1 else [(True, False), (False, True)]:
-                asked = search_simd.Asked()
-                asked.pair_count, asked.pairs, asked.pair_poses = self.pair_count, self.pairs, self.pair_poses
-                asked.tolerances, (asked.refreshes, asked.searches) = self._tolerances, steps
-                inputs = [asked, models, states, objects, self.work.counter, self._slabs, found, hits]
+                request = search_simd.SearchRequest()
+                request.pair_count, request.pairs, request.pair_poses = self.pair_count, self.pairs, self.pair_poses
+                request.tolerances, (request.refreshes, request.searches) = self._tolerances, steps
+                inputs = [request, models, states, objects, self.work.counter, self._slabs, found, hits]
                 inputs += [self.distances, self._memory]
                 made.append(launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device))
             return made
         started = {**threads, "dim": max(room, len(self.work.flag))}
         inputs = [length, self._tolerances, *shared, self._slabs, found, hits, self.work]
         searching = {"dim": self._warp_count() * lanes, "block_dim": WARP_SIZE, "device": device}
-        block = mean_slabs.THREADS if self.device.is_cuda else 1
+        block = mean_slabs.SLAB_THREADS if self.device.is_cuda else 1
         blocks = self.device.sm_count if self.device.is_cuda else 1
-        making = {"dim": blocks * block, "block_dim": mean_slabs.THREADS, "device": device}
+        making = {"dim": blocks * block, "block_dim": mean_slabs.SLAB_THREADS, "device": device}
         return [
             launch(frame.start_distance_kernel, inputs=[*posed, self._slabs, found, self.work], **started),
             launch(mean_slabs.make_slabs_kernel, inputs=[block, blocks, models, states, self._slabs], **making),
@@ -365,7 +364,7 @@ class DistanceQuery(Query):
             if name in views:
                 setattr(found, name, views[name][:n].copy())
                 continue
-            rows = getattr(answers, FIELDS.get(name, name))
+            rows = getattr(answers, ANSWER_FIELDS.get(name, name))
             rows = rows if len(rows) == n else first_rows(rows, n)
             setattr(found, name, wp.clone(rows) if device else rows.numpy().copy())
         return super()._make_result(found, device, with_rows)
@@ -374,7 +373,7 @@ class DistanceQuery(Query):
         """Return NumPy's views of the answers, where these are the host's memory."""
         made, views = self._answer_views
         if made != self.guard.buffers.number:
-            fields = {name: getattr(self.distances, FIELDS.get(name, name)) for name in (*DISTANCES, "points")}
+            fields = {name: getattr(self.distances, ANSWER_FIELDS.get(name, name)) for name in (*DISTANCES, "points")}
             views = {name: rows.numpy() for name, rows in fields.items()}
             self._answer_views = self.guard.buffers.number, views
         return views

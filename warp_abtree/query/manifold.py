@@ -11,7 +11,7 @@ Meshes meet in curves, and a curve alone has no depth. Here is what is made of i
   normal, at the deepest place. Where the normal of either face is within 60 degrees of the loop's and makes that
   depth no larger, it takes the place of the loop's: so a box in a corner is pushed by floor and wall, each its own way.
   So does that of either face, however it looks, where neither is within 60 degrees of the loop's and one looks the
-  other way: a loop that runs from one flank of a thread to the other has no one way out.
+  other way: a contact loop over both flanks of a screw thread has no single separating direction.
 * Of all candidates of the pair an outermost one is taken, then those farthest, in place and in normal, from the
   segments between those before, and the deepest, up to 8 of them or as many as asked for, in the order in which they
   lie along a fixed direction of the lower object: points that stay keep their order from launch to launch.
@@ -68,7 +68,7 @@ class ManifoldQuery(ContactQuery):
         points: Most points of a pair, 1 to 64. Those beyond the eighth lie farthest from any before them.
 
     Attributes:
-        manifolds: Points of each pair, device arrays (pair capacity, points) of `kernels.manifold.Manifolds`, float64.
+        manifolds: Points of each pair, device arrays (pair capacity, points) of `kernels.contacts.manifold.Manifolds`.
         point_max: Most points of a pair.
     """
 

@@ -11,6 +11,7 @@ from warp_abtree.checks.cpu_threads import cores_for, launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.base.lanes import WARP_SIZE
+from warp_abtree.kernels.exact.predicates import EXACT
 from warp_abtree.kernels.inside.containment import find_contained_kernel
 from warp_abtree.kernels.intersect import dual_tree, face_pairs, near_faces, relative_pose, simd, uncertain_pairs
 from warp_abtree.kernels.io.results import BLOCK_DIM as PACK_DIM
@@ -34,16 +35,14 @@ FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
 # So that each finds a slot for all that it gives away at once.
 WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 
-EXACT = int(PRECISIONS["exact"])
-
 
 def _mode(precision, with_gap: bool) -> int:
     return int(face_pairs.GAP if with_gap else PRECISIONS[precision])
 
 
 def _passes(precision, with_gap: bool) -> list:
-    """Return what decides what the traversal lists: kernels, their warps a multiprocessor, threads of a block."""
-    if int(PRECISIONS[precision]) != EXACT:
+    """Return the passes over the traversal's lists: kernels, their warps a multiprocessor, threads of a block."""
+    if int(PRECISIONS[precision]) != int(EXACT):
         return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS)]
     return [
         (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS),
@@ -55,11 +54,10 @@ def _passes(precision, with_gap: bool) -> list:
 class Query(QueryReadout):
     """Intersection of many object pairs as an operator: allocates once, launches many times.
 
-    `launch()` only launches, so that a CUDA graph can capture it, the first launch too. Objects added to the scene ask
-    for a new query; so do pairs filtered out of it, where the query runs the broad phase. A captured graph holds until
-    arrays that it uses are replaced: by these, by a change of LODs that takes more tree states than the scene had room
-    for, and by a buffer that grows. `result()` refuses what a stale graph has left. Keep the query as long as its
-    graphs.
+    `launch()` only launches, so that a CUDA graph can capture it, the first launch too. Make a new query after adding
+    objects to the scene, or filtering pairs where the query runs the broad phase. A captured graph holds until arrays
+    that it uses are replaced: by these, by a change of LODs that takes more tree states than the scene had room for,
+    and by a buffer that grows. `result()` refuses what a stale graph has left. Keep the query as long as its graphs.
 
     Args:
         scene: `Scene` or `Batch` whose poses and LODs hold at the time of each launch.
@@ -74,7 +72,7 @@ class Query(QueryReadout):
 
     Attributes:
         batch: `Batch` that is queried.
-        hits: Device arrays of the last launch (`kernels.traversal.face_pairs.Hits`), faces in no order.
+        hits: Device arrays of the last launch (`kernels.intersect.face_pairs.Hits`), faces in no order.
         pairs, pair_count: The pairs queried, device vec2i and int32 (1,).
         near: As `hits` for `within`: any_hit is 0 where a pair is proved apart; None without within.
 
@@ -172,7 +170,7 @@ class Query(QueryReadout):
             self._repeat((), near_faces.add_reach_kernel, len(self.pairs), inputs)
 
     def finish(self, count: int | None = None):
-        """Make of the hits whatever else is asked. Launches only.
+        """Compute further outputs of the hits. Launches only.
 
         Args:
             count: How many hits there are; None does what there is room for, as a graph must.

@@ -29,7 +29,7 @@ HEADER, COLUMNS = int(kernels.HEADER_WORDS), int(kernels.COUNT_COLUMNS)
 
 
 class QueryReadout(QueryBuffers):
-    """How a query reads what its launches found.
+    """Readout of a query: brings results of its launches to the host or into device arrays.
 
     On a GPU kernels pack it into memory that one copy brings over: first a header of demands with whatever has an entry
     a pair, then the rows, whose number is known by then. On the CPU the query's arrays are the host's memory already.
@@ -109,7 +109,7 @@ class QueryReadout(QueryBuffers):
         return self._bring(n, expected)
 
     def _repeats_calls(self, device: bool) -> bool:
-        """Return whether what `run` launches can be the same at every call."""
+        """Return whether the launches of `run` can be the same at every call."""
         return self.device.is_cuda and self._packs() and not device and self.broad_phase is None
 
     def _launch_and_bring(self, launch) -> Found:

@@ -1,4 +1,4 @@
-"""What a query is asked, and the room that it is given."""
+"""Requests of a query, checked: outputs, precisions, distances, and the capacity of its buffers."""
 
 from dataclasses import dataclass
 
@@ -64,7 +64,7 @@ def check_capacity(capacity) -> Buffers:
 
 
 def check_request(output: str, precision: str):
-    """Check what is asked of a query.
+    """Check output, precision and options of a query.
 
     Raises:
         ValueError: An unknown output or precision, or an output that another operator finds.

@@ -15,7 +15,7 @@ DISTANCES = ("distance", "bracket", "point_faces")
 # What a `FirstContactQuery` has.
 TIMES = ("time", "clear", "undecided")
 # What a result may have for its pairs; None where it was not asked for.
-ANSWERS = ("pairs", "any", "apart", "faces", "contacts", "pair_contacts", "points", *DISTANCES, *TIMES)
+RESULT_ARRAYS = ("pairs", "any", "apart", "faces", "contacts", "pair_contacts", "points", *DISTANCES, *TIMES)
 # Vectors of a contact.
 VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
 
@@ -137,7 +137,7 @@ class Result(DeviceMemory):
     exact_tests: Any
 
     def __init__(self, found: Found, room: tuple, output: str):
-        for name in ANSWERS:
+        for name in RESULT_ARRAYS:
             setattr(self, name, getattr(found, name))
         self.count: Any = found.count if output != "any" else None
         for name in COUNTERS:
@@ -145,7 +145,7 @@ class Result(DeviceMemory):
         self._totals, self._room = found.totals, room
 
     def __repr__(self):
-        held = [name for name in (*ANSWERS[1:], "count") if getattr(self, name) is not None]
+        held = [name for name in (*RESULT_ARRAYS[1:], "count") if getattr(self, name) is not None]
         return f"Result(pairs={len(self.pairs)}, {', '.join(held)})"
 
     def __len__(self):

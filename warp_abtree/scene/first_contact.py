@@ -1,4 +1,4 @@
-"""When moving objects first touch: `FirstContactQuery`.
+"""First contacts of moving objects, continuous collision detection (CCD): `FirstContactQuery`.
 
 In unit time each object goes from its pose in the scene to an end pose: its frame's origin on a straight line at
 constant speed, turning at constant angular velocity, the shortest way; or on a screw, along whose axis the object moves
@@ -31,19 +31,18 @@ from warp_abtree.kernels.motion import face_pair, group, path, search, start
 from warp_abtree.kernels.motion import linear as straight
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.commands import Commands
+from warp_abtree.query.distance import PAIRS_A_CORE
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import refuse_options
 from warp_abtree.query.result import Found, Result
 from warp_abtree.query.staging import first_rows
 from warp_abtree.scene.poses import HostPoses, check_poses, device_rows, place_rows
 
-COUNTER_COUNT = 4
-# Pairs that make a further core worth its while, which costs some 50 us.
-PAIRS_A_CORE = 4
+CONTACT_COUNTERS = 4
 TOLERANCE_LEAST = 2.0**-40
 
 
-def check_tolerance(tolerance) -> float:
+def check_time_tolerance(tolerance) -> float:
     """Return a tolerance of times.
 
     Raises:
@@ -62,7 +61,7 @@ def check_path(screw, linear):
 
 
 def check_asked_contacts(output, precision, options):
-    """Check what is asked of a sweep of motions.
+    """Check the options of a sweep of motions.
 
     Raises:
         TypeError: An option with another name, or no end poses.
@@ -74,12 +73,12 @@ def check_asked_contacts(output, precision, options):
     if "end_poses" not in options:
         raise TypeError(f"sweep needs end_poses for output {output!r}")
     refuse_options(output, {"precision": precision != "exact"})
-    check_tolerance(options.get("tolerance", 1e-6))
+    check_time_tolerance(options.get("tolerance", 1e-6))
     check_path(options.get("screw"), options.get("linear"))
 
 
 class SweptBroadPhase(BroadPhase):
-    """Broad phase of objects on their whole way, for a `FirstContactQuery`."""
+    """Broad phase of objects by swept boxes, for a `FirstContactQuery`."""
 
     def __init__(self, query, capacity, sorts):
         self._query = query
@@ -109,8 +108,8 @@ class FirstContactQuery(Query):
         linear: Whether vertices move straight instead, from one posed mesh to the other; whatever the turn.
 
     Attributes:
-        ends: End poses, which each launch reads: device arrays rotation and position of `kernels.arrays.ObjectPool`.
-        contacts: The last launch's answers, device arrays (pair capacity,) of `kernels.motion.start.Contacts`.
+        ends: End poses, which each launch reads: device arrays rotation and position of an `ObjectPool`.
+        contacts: The last launch's answers, device arrays (pair capacity,) of `kernels.motion.start.FirstContacts`.
 
     Raises:
         ValueError: As `Query` and `set_end_poses`; a tolerance out of range.
@@ -123,9 +122,9 @@ class FirstContactQuery(Query):
     def __init__(self, scene, end_poses, pairs=None, capacity=None, tolerance=1e-6, screw=False, linear=False):
         check_path(screw, linear)
         self._kind = straight.LinearMotion if linear else path.Motion
-        self.tolerance, self.screw, self.linear = check_tolerance(tolerance), bool(screw), bool(linear)
-        self.contacts, self.ends, self._ways = start.Contacts(), ObjectPool(), start.Ways()
-        self.contacts.counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
+        self.tolerance, self.screw, self.linear = check_time_tolerance(tolerance), bool(screw), bool(linear)
+        self.contacts, self.ends, self._motions = start.FirstContacts(), ObjectPool(), start.Motions()
+        self.contacts.counter = wp.zeros(CONTACT_COUNTERS, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity, sort_pairs=True)
         self.contacts.launched = self.guard.launched
         paths = path.Paths()
@@ -133,7 +132,7 @@ class FirstContactQuery(Query):
             dtype = wp.float64 if name == "angle" else wp.vec3d
             setattr(paths, name, wp.zeros(self.batch.object_count, dtype=dtype, device=self.device))
         self._make_ends()
-        self._ways.paths, self._ways.ends = paths, self.ends
+        self._motions.paths, self._motions.ends = paths, self.ends
         self._host_ends = HostPoses(self.ends, self.device)
         if end_poses is not None:
             self.set_end_poses(end_poses)
@@ -173,7 +172,7 @@ class FirstContactQuery(Query):
         Raises:
             ValueError: A tolerance out of range.
         """
-        asked = check_tolerance(tolerance), bool(screw)
+        asked = check_time_tolerance(tolerance), bool(screw)
         if asked != (self.tolerance, self.screw):
             self.tolerance, self.screw = asked
             self._commands = Commands()
@@ -193,12 +192,12 @@ class FirstContactQuery(Query):
         return [*made, (self, "_memory", memory)]
 
     def traverse(self):
-        """Decide which pairs in place intersect at first, and find when the others do. Launches only."""
+        """Decide which pairs in place intersect at first, and find first contacts of the others. Launches only."""
         super().traverse()
         self.search()
 
     def search(self):
-        """Find when the pairs in place do that are not marked as intersecting in `hits.any_hit`. Launches only."""
+        """Find first contacts of the pairs in place that `hits.any_hit` does not mark as met. Launches only."""
         if len(self.pairs):
             self.begin_motions()
             self.follow_motions()
@@ -222,9 +221,9 @@ class FirstContactQuery(Query):
     def _make_motions(self, launch) -> list:
         models, states, objects = self.batch.pools
         room, launch = len(self.pairs), partial(launch, device=self.device)
-        inputs = [self.screw, objects, self.ends, self._ways.paths]
+        inputs = [self.screw, objects, self.ends, self._motions.paths]
         paths = launch(path.prepare_path_kernel, dim=self.batch.object_count, inputs=inputs)
-        inputs = [models, states, objects, self._ways, self.pair_count, self.pairs, self.pair_poses]
+        inputs = [models, states, objects, self._motions, self.pair_count, self.pairs, self.pair_poses]
         inputs += [self.hits, self.contacts, self._motion]
         return [paths, launch(start.contact_starter(self._kind), dim=room, inputs=inputs, block_dim=WARP_SIZE)]
 

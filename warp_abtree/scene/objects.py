@@ -121,7 +121,7 @@ def check_numbers(values, what: str, low: int, high: int, count: int) -> list[in
     return numbers.astype(np.int64).tolist()
 
 
-def check_flags(values, what: str, count: int) -> list[bool]:
+def check_bools(values, what: str, count: int) -> list[bool]:
     """Return bools: one for all objects, or (count,).
 
     Raises:
@@ -150,8 +150,8 @@ def check_columns(models, worlds, importances, flags, bits) -> dict[str, list]:
     columns: dict[str, list] = {
         "world": check_numbers(worlds, "world", EVERY_WORLD, 2**31 - 1, count),
         "importance": check_numbers(importances, "importance", 1, 3, count),
-        "static": check_flags(statics, "static", count),
-        "solid": check_flags(solids, "solid", count),
+        "static": check_bools(statics, "static", count),
+        "solid": check_bools(solids, "solid", count),
         "group": check_numbers(groups, "collision_group", 0, ALL_BITS, count),
         "mask": check_numbers(masks, "collision_mask", 0, ALL_BITS, count),
     }

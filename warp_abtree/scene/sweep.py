@@ -13,7 +13,8 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.device_lock import device_lock
-from warp_abtree.kernels.io.sweep import NONE_REFUSED, pose_placer, report_chunk_kernel
+from warp_abtree.kernels.base.arrays import NONE_REFUSED
+from warp_abtree.kernels.io.sweep import pose_placer, report_chunk_kernel
 from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond, check_flags
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import refuse_signed
@@ -31,12 +32,12 @@ KEPT_PAIRS = 4
 KEPT_ROWS = 2**20
 
 # By the numbers of a row: quaternions, and matrices.
-TOLERANCE = {7: QUATERNION_TOLERANCE, 16: RIGID_TOLERANCE}
+POSE_TOLERANCE = {7: QUATERNION_TOLERANCE, 16: RIGID_TOLERANCE}
 DISTANCE_ROWS = np.dtype(
     [("distance", np.float64), ("bracket", np.float64, 2), ("points", np.float64, (2, 3)), ("faces", np.int32, 2)]
 )
 CONTACT_ROWS = np.dtype([("time", np.float64), ("clear", bool), ("undecided", bool)])
-ANSWERS = {"any": np.dtype(bool), "count": np.dtype(np.int64)}
+PACKED_DTYPES = {"any": np.dtype(bool), "count": np.dtype(np.int64)}
 
 _kept: dict[tuple, "_PosedModels"] = {}
 
@@ -133,7 +134,8 @@ class _ChunkQuery:
         """Return the slots of poses of one type, made at the first use."""
         kind = poses.scalar, poses.width
         if kind not in self._slots:
-            made = [_Slot(self.device, self.room, self.output, *kind) for _ in range(1 + (self.output in ANSWERS))]
+            count = 1 + (self.output in PACKED_DTYPES)
+            made = [_Slot(self.device, self.room, self.output, *kind) for _ in range(count)]
             if self.device.is_cuda:
                 # Another stream may touch what was allocated on this one only once it is there.
                 wp.synchronize_device(self.device)
@@ -156,7 +158,7 @@ class _ChunkQuery:
         slot.report.fill_(NONE_REFUSED)
         kernel = pose_placer(slot.poses.dtype, slot.width)
         objects = self.objects.pool if objects is None else objects
-        inputs = [wp.float64(TOLERANCE[slot.width]), slot.poses, objects, slot.report]
+        inputs = [wp.float64(POSE_TOLERANCE[slot.width]), slot.poses, objects, slot.report]
         wp.launch(kernel, self.count, inputs, device=self.device)
 
     def _launch(self, slot):
@@ -200,7 +202,7 @@ class _ChunkQuery:
 
     def find_answers(self, poses):
         """Return "any" or "count" of all poses."""
-        answers = np.empty(len(poses), ANSWERS[self.output])
+        answers = np.empty(len(poses), PACKED_DTYPES[self.output])
         slots, waiting = self._find_slots(poses), deque()
 
         def finish():
@@ -291,7 +293,7 @@ class _ChunkQuery:
 
 def apart_rows(output) -> np.dtype:
     """Return the type of the answers of a sweep with `within`."""
-    return np.dtype([(output, ANSWERS[output]), ("apart", np.dtype(bool))])
+    return np.dtype([(output, PACKED_DTYPES[output]), ("apart", np.dtype(bool))])
 
 
 def _keep(key, posed):
@@ -368,7 +370,7 @@ def _sweep(pair, poses, asked, options):
     if output == "first_contact":
         precision = "linear" if options.pop("linear", False) else "rigid"
     if len(poses) == 0:
-        kinds = {**ANSWERS, "distance": DISTANCE_ROWS, "first_contact": CONTACT_ROWS}
+        kinds = {**PACKED_DTYPES, "distance": DISTANCE_ROWS, "first_contact": CONTACT_ROWS}
         kind = kinds.get(output) if within is None else apart_rows(output)
         return np.empty((0, 3), np.int32) if output == "faces" else np.empty(0, kind)
     models = [pair.models[i] for i in pair.object_model]

@@ -128,7 +128,7 @@ class RigidBodies(DeviceMemory):
     """State of the bodies of a scene; `Dynamics` documents the arguments.
 
     Attributes:
-        bodies: Device arrays of all objects, `kernels.dynamics.bodies.Bodies`.
+        bodies: Device arrays of all objects, `kernels.bodies.bodies.Bodies`.
         mass: Mass at density 1, (n,), inf unless rigid.
         rigid, kinematic: Which objects are rigid bodies, and which have prescribed motion, bool (n,).
         targets: `ObjectPool` of the poses that kinematic objects have at the end of the next step.
@@ -173,10 +173,13 @@ class RigidBodies(DeviceMemory):
     def _first_reach(self, velocity, angular_velocity, radii):
         """Return how far ahead contacts of the first step are looked for, as if it took FIRST_STEP, (n, 4)."""
         radius = np.where(self.rigid, radii, 0.0)
-        turn, most = FIRST_STEP * np.linalg.norm(angular_velocity, axis=1) * radius, float(kernels.REACH_MAX) * radius
+        turn, most = (
+            FIRST_STEP * np.linalg.norm(angular_velocity, axis=1) * radius,
+            float(kernels.LOOKAHEAD_MAX) * radius,
+        )
         motion = FIRST_STEP * np.where(self.rigid[:, None], velocity, 0.0)
         length = np.maximum(np.linalg.norm(motion, axis=1), 1e-300)
-        reach = np.minimum(turn, most) + float(kernels.REACH_LEAST) * radius
+        reach = np.minimum(turn, most) + float(kernels.LOOKAHEAD_LEAST) * radius
         return np.column_stack([motion * np.minimum(most / length, 1.0)[:, None], reach])
 
     def clear_targets(self):

@@ -1,4 +1,4 @@
-"""How well a run of frames held its time budget: `budget_report`, and whether one could: `cost_at_coarsest`."""
+"""Report of a run of frames against its time budget: `budget_report`; the least it can cost: `cost_at_coarsest`."""
 
 import numpy as np
 

@@ -27,7 +27,7 @@ class NearestQuery(DistanceQuery):
             chosen.count, chosen.pairs, chosen.beyond = self.pair_count, self.pairs, self._found.beyond
 
     def cut(self, query, gap, bodies):
-        """Cut the gaps of a query's pairs, which there is room for; see `kernels.dynamics.ahead`. Launches only."""
+        """Cut the gaps of a query's pairs, which there is room for; see `kernels.bodies.ahead`. Launches only."""
         room, pools, chosen = len(query.pairs), self.batch.pools, self._chosen
         given = query.guard.given()
         with self.guard.launching(self):
@@ -54,7 +54,7 @@ class AheadQuery(ManifoldQuery):
 
     Args:
         scene, capacity: As for `ManifoldQuery`.
-        bodies: `kernels.dynamics.bodies.Bodies` of all objects; its `reach` is the widest gap.
+        bodies: `kernels.bodies.bodies.Bodies` of all objects; its `reach` is the widest gap.
     """
 
     def __init__(self, scene, bodies, capacity=None):

@@ -1,4 +1,4 @@
-"""The motions of a step, cut where surfaces that are apart would meet: `CertifiedWays`."""
+"""Continuous collision of a step: motions cut where surfaces that are apart would meet: `CertifiedMotions`."""
 
 import warp as wp
 
@@ -8,25 +8,25 @@ from warp_abtree.query.request import Buffers
 from warp_abtree.scene.first_contact import FirstContactQuery
 from warp_abtree.scene.scene import Scene
 
-TOLERANCE = 2.0**-24  # of times, as a fraction of a step's motion
+TIME_TOLERANCE = 2.0**-24  # of times, as a fraction of a step's motion
 INTEGERS = [(name, wp.int32) for name in ("is_changed", "is_held", "stuck")]
-MODES = kernels.CUT, kernels.MATCH, kernels.HOLD, kernels.CERTIFY
+ROUND_MODES = kernels.CUT, kernels.MATCH, kernels.HOLD_BOTH, kernels.CERTIFY
 # What each round does with the pairs that it does not prove clear.
-ROUNDS = [int(mode) for mode, times in zip(MODES, (5, 4, 3, 1)) for _ in range(times)]
+ROUNDS = [int(mode) for mode, times in zip(ROUND_MODES, (5, 4, 3, 1)) for _ in range(times)]
 
 
-class CertifiedWays(FirstContactQuery):
-    """How far each object goes towards its goal, so that no two surfaces meet that were apart.
+class CertifiedMotions(FirstContactQuery):
+    """Fractions of the objects' motions towards their goals for which no two surfaces meet that were apart.
 
     Pairs whose surfaces intersect at first do not count, nor do those without a rigid body.
 
     Args:
         scene: `Scene` whose poses are where motions start, and where `end` puts them.
-        bodies: `kernels.dynamics.bodies.Bodies` of all objects.
+        bodies: `kernels.bodies.bodies.Bodies` of all objects.
         capacity: `Buffers`: object pairs that there is room for at first.
 
     Attributes:
-        goals: Poses that a step aims for, device arrays rotation and position of `kernels.arrays.ObjectPool`.
+        goals: Poses that a step aims for, device arrays rotation and position of `kernels.base.arrays.ObjectPool`.
         fraction: How much of its motion each object made in the last step, device float64 (n,), 0 to 1.
     """
 
@@ -34,8 +34,8 @@ class CertifiedWays(FirstContactQuery):
         self._pool, n = scene.batch().objects.pool, scene.object_count
         self._bodies, self.goals = bodies, ObjectPool()
         self.goals.rotation, self.goals.position = wp.clone(self._pool.rotation), wp.clone(self._pool.position)
-        self._state, self._is_begun = kernels.Ways(), False
-        super().__init__(scene, None, None, capacity, TOLERANCE)
+        self._state, self._is_begun = kernels.StepMotions(), False
+        super().__init__(scene, None, None, capacity, TIME_TOLERANCE)
         state, shared = self._state, self.broad_phase.shared_group
         state.goals, state.ends = self.goals, self.ends
         for name, dtype in (("fraction", wp.float64), ("cut", wp.float64), *INTEGERS):
@@ -64,7 +64,7 @@ class CertifiedWays(FirstContactQuery):
         self._run(kernels.begin_way_kernel, len(self.fraction), [self._pool, self._bodies, self._state])
 
     def traverse(self):
-        """Cut the ways of objects in rounds, from goals on. Launches only."""
+        """Cut the motions of objects in rounds, from goals on. Launches only."""
         room, n, state = len(self.pairs), len(self.fraction), self._state
         if not self._is_begun:  # a traversal again, with more room
             self._begin()
@@ -96,7 +96,7 @@ class CertifiedWays(FirstContactQuery):
         self._run(kernels.free_stuck_kernel, len(self.fraction), [dt, self._pool, self._bodies, self._state])
 
     def end(self, velocity_change):
-        """Pose objects where their ways end, unless there was no room for all pairs. Launches only.
+        """Pose objects where their motions end, unless there was no room for all pairs. Launches only.
 
         Args:
             velocity_change: What gravity changes velocities by in a step [world units/s].
@@ -110,7 +110,7 @@ class CertifiedWays(FirstContactQuery):
         return totals.pairs <= len(self.pairs) and (not lists or totals.uncertain <= lists)
 
     def pair_totals(self) -> dict:
-        """Return what the last step met, by name. Waits for the device.
+        """Return counts of the last step's pairs, by name. Waits for the device.
 
         touching: pairs whose surfaces intersected at its start; undecided: pairs held because contact was neither
         proved nor excluded, once a round; held: pairs for which a whole world stood still.

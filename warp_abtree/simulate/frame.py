@@ -26,7 +26,7 @@ from warp_abtree.query.result import Result
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.budget_report import budget_report, cost_at_coarsest
 from warp_abtree.simulate.frame_file import FrameFile
-from warp_abtree.simulate.frame_row import FrameRow, LodTable
+from warp_abtree.simulate.frame_row import FrameRow, LodColumns
 from warp_abtree.simulate.frame_stages import FrameStages
 from warp_abtree.simulate.motion import Kinematic
 from warp_abtree.simulate.rigid_bodies import SteppedMotion
@@ -370,7 +370,7 @@ class Frame(DeviceMemory):
         self._direction = np.where(direction == 0, self._direction, direction)
         self._lods = lods
         keys, repeats = np.unique((np.array(scene.object_model, np.int64) << 32) + lods, return_counts=True)
-        self._lod_columns = LodTable(scene.models, keys >> 32, keys & (2**32 - 1)).columns(repeats)
+        self._lod_columns = LodColumns(scene.models, keys >> 32, keys & (2**32 - 1)).columns(repeats)
         return changed, oscillations
 
 

@@ -1,4 +1,4 @@
-"""What one frame did: `FrameRow`, and what its LODs amount to."""
+"""The row of one frame, `FrameRow`: counts, times, and statistics of its LODs."""
 
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -10,7 +10,7 @@ from warp_abtree.lod.timing import STAGES
 
 @dataclass(frozen=True)
 class FrameRow:
-    """What one frame did.
+    """Record of one frame.
 
     Attributes:
         frame, time: Number from 0, and time in the scene [s].
@@ -71,7 +71,7 @@ class FrameRow:
         return [*(field.name for field in fields(cls)), "total_ms"]
 
 
-class LodTable:
+class LodColumns:
     """Columns of a `FrameRow` about LODs.
 
     Args:

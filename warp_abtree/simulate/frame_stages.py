@@ -16,11 +16,9 @@ from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.scene.poses import check_poses, launch_place
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.frame_row import LodTable
+from warp_abtree.simulate.frame_row import LodColumns
 from warp_abtree.simulate.rigid_bodies import Dynamics
 from warp_abtree.state.device_update import LevelStates, shares_levels
-
-HEAD = int(words.HEAD)
 
 
 class FrameStages:
@@ -36,7 +34,7 @@ class FrameStages:
 
     Attributes:
         query: The query of the frame.
-        table: `LodTable` of the levels of the controller; None without.
+        table: `LodColumns` of the levels of the controller; None without.
         summary: Words of `kernels.lod.frame_summary`, on the host once `read`, int64.
     """
 
@@ -58,10 +56,10 @@ class FrameStages:
         self.table: Any = None
         if controller is not None:
             self._levels = self._make_levels(controller)
-            self.table = LodTable(scene.models, self._levels.level_model, self._levels.level_lod)
+            self.table = LodColumns(scene.models, self._levels.level_model, self._levels.level_lod)
         self._upload = Upload(7 * scene.object_count, self.device)
         self._rows = self._upload.array.reshape((-1, 7))
-        length = HEAD + (0 if self.table is None else len(self.table.lod))
+        length = int(words.HEAD) + (0 if self.table is None else len(self.table.lod))
         self._summary = self._host_summary = self._zeros(length, wp.int64)
         if self.device.is_cuda:
             self._host_summary = wp.zeros(length, dtype=wp.int64, device="cpu", pinned=True)
@@ -108,7 +106,7 @@ class FrameStages:
         self.find()
 
     def arrays(self) -> tuple:
-        """Return what stands for all arrays that launches are given: while it does, a graph of them holds."""
+        """Return a token of all arrays that launches are given: while it stands, a graph of them holds."""
         certified = None if self.dynamics is None else self.dynamics.certified
         return *self.query.guard.given(), *(() if certified is None else certified.guard.given())
 
@@ -200,7 +198,7 @@ class FrameStages:
             summary[words.LAUNCHED] >= 0
             and 0 <= summary[words.PAIRS] <= room
             and (not listed or summary[words.HITS] <= len(hits.face))
-            and (not len(hits.uncertain) or max(summary[[words.UNCERTAIN, words.APART]]) <= len(hits.uncertain))
+            and (not len(hits.uncertain) or max(summary[[words.UNCERTAIN_PAIRS, words.APART]]) <= len(hits.uncertain))
         )
 
     def find(self, between=None):

@@ -17,15 +17,15 @@ from warp_abtree.kernels.base.arrays import LAST_KEY
 from warp_abtree.kernels.bodies import bodies as body_kernels
 from warp_abtree.kernels.bodies import constraints as constraint_kernels
 from warp_abtree.kernels.bodies import graph_coloring, solve
+from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT
 from warp_abtree.query.manifold import POINTS_MAX
 from warp_abtree.query.request import Buffers, check_capacity
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.body_state import RigidBodies, zeros_of
 from warp_abtree.simulate.contacts_ahead import AheadQuery
-from warp_abtree.simulate.continuous import CertifiedWays
+from warp_abtree.simulate.continuous import CertifiedMotions
 
-COLOR_COUNT = int(graph_coloring.COLOR_COUNT)
-SHELL = 0.75 * float(body_kernels.REACH_LEAST)  # with continuous bodies rest half a slop apart or more, in reach
+SHELL = 0.75 * float(body_kernels.LOOKAHEAD_LEAST)  # with continuous bodies rest half a slop apart or more, in reach
 ITERATIONS = 32  # rounds of relaxation over all contacts in a step
 COLOR_ROUNDS = 2  # of the graph coloring, each color; one makes almost twice as many colors
 LAST_COLORS = 8  # first of the last colors, which one block relaxes
@@ -52,9 +52,9 @@ class Dynamics(RigidBodies):
 
     Attributes:
         bodies, mass, rigid, kinematic: As `RigidBodies`.
-        certified: With `continuous`, `CertifiedWays`, what the last step made of each motion; else None.
+        certified: With `continuous`, `CertifiedMotions`, what the last step made of each motion; else None.
         query: The `AheadQuery` of the last step: its pairs, contacts and contact points.
-        constraints: Their impulses and colors, `kernels.dynamics.constraints.Constraints`.
+        constraints: Their impulses and colors, `kernels.bodies.constraints.Constraints`.
 
     Raises:
         ValueError: A number out of range or of the wrong shape, or a body without a volume.
@@ -80,7 +80,7 @@ class Dynamics(RigidBodies):
         self.query = AheadQuery(scene, self.bodies, capacity)
         self.certified = None
         if flag(continuous, "continuous"):
-            self.certified = CertifiedWays(scene, self.bodies, Buffers(pairs=check_capacity(capacity).pairs))
+            self.certified = CertifiedMotions(scene, self.bodies, Buffers(pairs=check_capacity(capacity).pairs))
         # No body is in two pairs of a color.
         self._color_room = max(1, int(np.count_nonzero(self.rigid)))
         # On the CPU threads run one after another, and a color more costs nothing.

@@ -1,1 +1,1 @@
-"""What an LOD decides, on a device: tree states and their updates."""
+"""Tree states, what an LOD decides, and their updates, on a device."""

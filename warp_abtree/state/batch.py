@@ -16,7 +16,7 @@ from warp_abtree.state.solids import SolidArrays
 
 
 class Batch(DeviceMemory):
-    """What queries are about: the objects of a device, the tree states that they stand at, and their models.
+    """Objects of a device that queries are about, the tree states that they stand at, and their models.
 
     `Scene.batch()` returns that of a scene, which makes another when objects are added; `Pipeline` and `sweep` make
     their own, on the same models.

@@ -20,7 +20,7 @@ STALE_GRAPH = (
 
 
 class Generation:
-    """How often arrays were replaced, on the host and on the device.
+    """Counter of array replacements, on the host and on the device.
 
     Attributes:
         number: On the host.

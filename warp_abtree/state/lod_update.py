@@ -61,7 +61,7 @@ def choose_states(states: StateArrays, wanted: set, used: set) -> tuple[list, di
 
 
 class LodUpdate(WorkLists):
-    """What a change of LODs does, one entry an updated state: allocated when made, then launched once.
+    """Plan of a change of LODs, one entry an updated state: allocated when made, then launched once.
 
     Args:
         moves: (state, lod, source) of each update, as `choose_states` returns them.

@@ -47,7 +47,7 @@ def update_kernels(face_counts, device) -> list:
     """
     most = 2 ** int(block_update.BLOCK_DEPTH) if device.is_cpu else BLOCK_FACES
     by_blocks = [current_regime().block_updates and count <= most for count in face_counts]
-    kernels: list = [(block_update.state_update(False), block_update.THREADS)] if any(by_blocks) else []
+    kernels: list = [(block_update.state_update(False), block_update.BLOCK_THREADS)] if any(by_blocks) else []
     if not all(by_blocks):
         kernels += [(refit.refit_top_kernel, refit.TOP_THREADS)]
         kernels += [(kernel, 256) for kernel in (refit.refit_level_kernel, refine.refine_all_kernel)]
@@ -119,7 +119,7 @@ class WorkLists(DeviceMemory):
         if self.device.is_cuda:
             shallow = self.depth <= block_update.SHALLOW_DEPTH and self.block_room > self.device.sm_count
             few_faces = SMALL_THREADS if self.depth <= SMALL_DEPTH else SHALLOW_THREADS
-            blocks, threads = min(self.block_room, BLOCKS_MOST), few_faces if shallow else block_update.THREADS
+            blocks, threads = min(self.block_room, BLOCKS_MOST), few_faces if shallow else block_update.BLOCK_THREADS
         inputs = [blocks, threads, models, self._scratch, states, self.plan]
         kernel = block_update.state_update(shallow)
         wp.launch(kernel, (blocks, threads), inputs, block_dim=threads, device=self.device)

@@ -1,4 +1,4 @@
-"""What speed costs in accuracy, setting by setting, against the exact answer at the finest LODs."""
+"""Accuracy against speed, setting by setting, beside the exact answer at the finest LODs."""
 
 from functools import partial
 

@@ -1,4 +1,4 @@
-"""Distances: what a coarse LOD costs and gets wrong, beside a tolerance at the finest LODs, and python-fcl on the LODs.
+"""Distances: cost and error of a coarse LOD, beside a tolerance at the finest LODs, and python-fcl on the LODs.
 
 Poses lie along the motions, `GAPS` before the first contact. Each search starts anew. A LOD proves that the originals
 are no nearer than its distance less both certified errors, a tolerance that they are no nearer than its bracket's lower

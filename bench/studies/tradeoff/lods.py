@@ -1,4 +1,4 @@
-"""What a level of detail costs and gets wrong, against the exact answer at the finest LODs."""
+"""Cost and error of a level of detail, against the exact answer at the finest LODs."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What the other settings cost and get wrong: precision, output, and a margin around the surfaces.
+"""Cost and error of the other settings: precision, output, and a margin around the surfaces.
 
 Boxes have no setting of their own: their margin covers rounding, and no answer depends on it. What widens them on
 purpose is `within=`: pairs that are not proved farther apart than a distance count as intersecting, so that a coarse

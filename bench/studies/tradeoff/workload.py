@@ -1,4 +1,4 @@
-"""What the trade-off is measured on: two models, motions of B towards A, and poses along them."""
+"""Workloads of the trade-off: two models, motions of B towards A, and poses along them."""
 
 import numpy as np
 

@@ -88,7 +88,7 @@ struct NearFaces {
         }
         return best;
     }
-    // As `nearest_face`: the first face within the limit, else the one with the least bound.
+    // As `nearest_candidate`: the first face within the limit, else the one with the least bound.
     int cover(const Polygon& p, double limit, double& bound) const {
         int best = -1;
         bound = __builtin_inf();

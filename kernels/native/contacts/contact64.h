@@ -1,4 +1,4 @@
-// What contacts of 8 face pairs take, as functions of the same names one by one: no rounding differs.
+// Arithmetic of contacts in 8 lanes, as functions of the same names one by one: no rounding differs.
 #pragma once
 #include "builtin.h"
 #include "base/sizes.h"

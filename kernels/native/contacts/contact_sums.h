@@ -1,5 +1,5 @@
 // Sums over the contacts of an object pair on the CPU: 8 contacts at a time, each sum in the order of
-// `contact.summary`.
+// `contacts.summary`.
 #pragma once
 #include "builtin.h"
 #include "contacts/contact64.h"

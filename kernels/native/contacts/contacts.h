@@ -1,4 +1,4 @@
-// Contacts of the CPU: those of 8 face pairs at a time, as `find_contact` one by one.
+// Contacts of the CPU: those of 8 face pairs at a time, as `find_contact_kernel` one by one.
 #pragma once
 #include "builtin.h"
 #include "contacts/near64.h"

@@ -1,4 +1,4 @@
-// Double words in 8 lanes, as `arithmetic.double_word`, whose source and bounds are these.
+// Double words in 8 lanes, as `exact.double_word`, whose source and bounds are these.
 #pragma once
 #include "builtin.h"
 #include "base/float64.h"

@@ -1,4 +1,4 @@
-// What a thread of the CPU keeps of a search for the nearest faces.
+// Memory of a CPU thread that searches for the nearest faces.
 #pragma once
 #include "builtin.h"
 #include "base/sizes.h"
@@ -33,9 +33,9 @@ struct NearestMemory {
         return m;
     }
     // Under which a pair of faces matters, as `cut_of`.
-    static float cut_of(float upper, const wp::vec_t<4, float>& spare) {
-        const float part = spare[1] * upper - spare[2], more = part > spare[0] ? part : spare[0];
-        const float off = more - spare[3] * upper;
+    static float cut_of(float upper, const wp::vec_t<4, float>& terms) {
+        const float part = terms[1] * upper - terms[2], more = part > terms[0] ? part : terms[0];
+        const float off = more - terms[3] * upper;
         return off > 0.0f ? upper - off : upper;
     }
 };

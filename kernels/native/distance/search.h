@@ -5,9 +5,9 @@
 #include "distance/corners32.h"
 #include "distance/memory.h"
 
-template <class ModelPool, class StatePool, class PairPose, class Frame, class Slabs>
-wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairPose pose, Frame frame,
-                                       wp::vec_t<4, wp::float32> spare, Slabs slabs, bool with_slabs, wp::int32 thread,
+template <class ModelPool, class StatePool, class PairPose, class SearchScale, class Slabs>
+wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairPose pose, SearchScale scaling,
+                                       wp::vec_t<4, wp::float32> terms, Slabs slabs, bool with_slabs, wp::int32 thread,
                                        wp::array_t<wp::float32> memory) {
 #if defined(__CUDA_ARCH__)
     __trap();  // warps have a search of their own
@@ -21,9 +21,9 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
     const auto& r = pose.rotation32.data;
-    NearBoxes boxes = NearBoxes::make(r, frame.back, frame.translation, frame.margin, frame.scale, states.node_box.data,
-                                      pose.node_a, pose.node_b);
-    boxes.margin = SLAB_MARGINS * frame.margin;
+    NearBoxes boxes = NearBoxes::make(r, scaling.back, scaling.translation, scaling.margin, scaling.scale,
+                                      states.node_box.data, pose.node_a, pose.node_b);
+    boxes.margin = SLAB_MARGINS * scaling.margin;
     if (with_slabs) {
         boxes.slabs = (const char*)slabs.record.data - (const char*)states.node_box.data;
         boxes.normals = h.face_tests >= NORMALS_LEAST;
@@ -34,9 +34,9 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     float cut = 0.0f, limit = 0.0f, soon = 0.0f;
     auto set_limits = [&]() {
         constexpr float PART[] = {0.6f, 0.85f, 1.0f};
-        cut = h.found ? NearestMemory::cut_of(h.upper, spare) : h.upper;
+        cut = h.found ? NearestMemory::cut_of(h.upper, terms) : h.upper;
         auto to_bound = [&](float x) {
-            const float y = 2.0f * (x * frame.grow + frame.least);
+            const float y = 2.0f * (x * scaling.grow + scaling.least);
             return x < 0.0f ? -1.0f : y * y;
         };
         limit = to_bound(cut);
@@ -45,11 +45,12 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     auto measure = [&](int count) {
         waiting -= count;
         wp::int64* items = m.face + waiting;
-        const N::Corners corners = NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a,
-                                                        pose.corner_b, r, frame.translation, frame.scale, items, count);
+        const N::Corners corners =
+            NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a, pose.corner_b, r,
+                                 scaling.translation, scaling.scale, items, count);
         F::lanes size;
         const F::lanes d = __builtin_elementwise_sqrt(N::measure(corners, size));
-        const F::lanes error = N::error_of(d, size, frame.error), over = d + error, under = d - error;
+        const F::lanes error = N::error_of(d, size, scaling.error), over = d + error, under = d - error;
         float low[16];
         h.diving = 0;
         for (int i = 0; i < count; ++i)

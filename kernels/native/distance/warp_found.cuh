@@ -1,4 +1,4 @@
-// What all warps at work on an object pair have found.
+// Upper bounds and nearest faces shared by all warps at work on an object pair.
 #pragma once
 #include "builtin.h"
 

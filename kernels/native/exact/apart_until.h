@@ -1,4 +1,4 @@
-// How long two faces stay apart whose corners move straight, in double words.
+// Linear CCD in double words: the time until which two faces stay apart whose corners move straight.
 #pragma once
 #include "builtin.h"
 #include "exact/moving_faces.h"

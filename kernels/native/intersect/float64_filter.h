@@ -1,4 +1,4 @@
-// The float64 filter of the CPU: 8 face pairs at a time, as `filter_triangles` one by one.
+// The float64 filter of the CPU: 8 face pairs at a time, as `float64_filter_triangles` one by one.
 #pragma once
 #include "builtin.h"
 #include "base/sizes.h"

@@ -1,4 +1,4 @@
-// Where what node pair tests emit goes: one scan over a warp for three lists.
+// Places of the items that node pair tests emit: one prefix sum over a warp for three lists.
 #pragma once
 #include "builtin.h"
 #include "base/sizes.h"

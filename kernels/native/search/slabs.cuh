@@ -1,4 +1,4 @@
-// What blocks that make the slabs of one tree state tell each other.
+// Messages between the blocks that make the slabs of one tree state.
 #pragma once
 #include "builtin.h"
 

@@ -4,7 +4,7 @@ import argparse
 import re
 
 PROGRAM = "warp-abtree"
-STATUS = """\
+EXIT_STATUS = """\
 exit status:
   0    done
   1    work was lost, a device failed, or the reader of the output went away
@@ -14,7 +14,7 @@ exit status:
 """
 MESHES = 'a mesh file, gzipped or not, or "warp:bunny", "warp:bear", "warp:rocks"'
 LOD_HELP = "a number with a dot is a fraction of the faces in (0, 1], a whole number a LOD, or tol:X, finest, coarsest"
-PRECISIONS = ("exact", "float32")
+PRECISION_NAMES = ("exact", "float32")
 _NEGATIVE = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|^-(inf|nan)$")
 
 
@@ -44,7 +44,7 @@ def shield_numbers(words) -> list:
     return [f" {word}" if _NEGATIVE.match(word) else word for word in words]
 
 
-def positive(text) -> int:
+def positive_count(text) -> int:
     """Return a whole number from 1."""
     try:
         value = int(text)

@@ -14,7 +14,7 @@ from pathlib import Path
 import warp as wp
 
 from warp_abtree.app.cli import bench_command, model_commands, query_command, run_command, sweep_command
-from warp_abtree.app.cli.arguments import PROGRAM, STATUS, Parser, PrintCompletion, shield_numbers
+from warp_abtree.app.cli.arguments import EXIT_STATUS, PROGRAM, Parser, PrintCompletion, shield_numbers
 from warp_abtree.app.cli.progress import Progress, compile_notice, start_warp
 from warp_abtree.app.pictures import command as picture_command
 from warp_abtree.app.viewer import command as view_command
@@ -27,7 +27,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog=PROGRAM,
         description="Mesh-mesh interference queries at any level of detail (LOD), in batches, on CUDA or the CPU.",
-        epilog=f"examples:\n  {PROGRAM} info warp:bunny\n  {PROGRAM} run bunny_tori --picture out.png\n\n{STATUS}",
+        epilog=f"examples:\n  {PROGRAM} info warp:bunny\n  {PROGRAM} run bunny_tori --picture out.png\n\n{EXIT_STATUS}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
@@ -57,9 +57,9 @@ def make_parser() -> argparse.ArgumentParser:
     for name, module, function in (
         ("query", query_command, query_command.query),
         ("run", run_command, run_command.run),
-        ("view", view_command, view_command.view),
+        ("view", view_command, view_command.run_viewer),
         ("picture", picture_command, picture_command.picture),
-        ("sweep", sweep_command, sweep_command.sweep),
+        ("sweep", sweep_command, sweep_command.run_sweep),
     ):
         command(name, function, module.SUMMARY, module.EXAMPLES, module.add_arguments)
     command("bench", None, bench_command.SUMMARY, bench_command.EXAMPLES, bench_command.add_arguments)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.app.cli.arguments import MESHES, PROGRAM, Parser, positive
+from warp_abtree.app.cli.arguments import MESHES, PROGRAM, Parser, positive_count
 from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.mesh import describe_mesh, load_mesh, mesh_from_arrays
@@ -86,7 +86,9 @@ def add_build_arguments(sub: Parser):
     """Add the arguments of `build`."""
     sub.add_file("mesh", metavar="MESH", nargs="+", help=f"{MESHES}; one after another")
     sub.add_file("out", metavar="OUT", type=Path, help="file to write (.npz), or a folder for NAME.npz of each mesh")
-    sub.add_argument("--base-faces", type=positive, default=10, metavar="N", help="faces of the coarsest LOD (10)")
+    sub.add_argument(
+        "--base-faces", type=positive_count, default=10, metavar="N", help="faces of the coarsest LOD (10)"
+    )
     sub.add_argument(
         "--orient", action="store_true", help="turn faces that disagree with neighbours or point into the solid"
     )

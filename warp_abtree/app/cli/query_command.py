@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.app.cli.arguments import LOD_HELP, MESHES, PRECISIONS, Parser
+from warp_abtree.app.cli.arguments import LOD_HELP, MESHES, PRECISION_NAMES, Parser
 from warp_abtree.app.cli.model_commands import active_count, load_model, lod_at
 from warp_abtree.app.cli.report import check_output, print_result, show_number
 from warp_abtree.checks.atomic_write import atomic_write
@@ -35,7 +35,7 @@ def add_arguments(sub: Parser):
     sub.add_argument("--lod-b", default="finest", metavar="LOD", help="the same for B (finest)")
     sub.add_argument("--output", choices=OUTPUTS, default="count", help="what to ask (count)")
     about = "signs of determinants: exact, or of the rounded ones (exact)"
-    sub.add_argument("--precision", choices=PRECISIONS, default="exact", help=about)
+    sub.add_argument("--precision", choices=PRECISION_NAMES, default="exact", help=about)
     about = "width of the bracket that ends the search of a distance (0)"
     sub.add_argument("--tolerance", type=float, metavar="X", help=about)
     sub.add_argument("--relative", type=float, metavar="X", help="the same as a fraction of the distance (0)")

@@ -1,4 +1,4 @@
-"""What all commands print and check: JSON for programs, lines and tables for people, files that are written."""
+"""Output of all commands: JSON for programs, lines and tables for people, and checks of files to be written."""
 
 import json
 import math

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.app.cli.arguments import PROGRAM, Parser, milliseconds, positive
+from warp_abtree.app.cli.arguments import PROGRAM, Parser, milliseconds, positive_count
 from warp_abtree.app.cli.model_commands import active_count
 from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.app.pictures.plots import draw_run
@@ -32,9 +32,11 @@ def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
     about = f"scene file (.toml), or one of {', '.join(scene_names())}"
     sub.add_file("scene", metavar="SCENE", help=about)
-    sub.add_argument("--frames", type=positive, metavar="N", help="frames to run (the scene's own number)")
+    sub.add_argument("--frames", type=positive_count, metavar="N", help="frames to run (the scene's own number)")
     sub.add_file("--picture", type=Path, metavar="PNG", help="draw the scene, intersecting faces coloured")
-    sub.add_argument("--objects", type=positive, metavar="N", help="about so many objects, by other counts or worlds")
+    sub.add_argument(
+        "--objects", type=positive_count, metavar="N", help="about so many objects, by other counts or worlds"
+    )
     sub.add_argument("--budget", type=milliseconds, metavar="TIME", help="time of a frame to hold, as 8ms or 0.008s")
     sub.add_argument("--controller", choices=CONTROLLERS, help="what chooses LODs (the scene's own, or predictive)")
     about = "write a row a frame as it ends, .csv or .json"

@@ -6,7 +6,7 @@ import sys
 import time
 from pathlib import Path
 
-from warp_abtree.app.cli.arguments import PRECISIONS, Parser, positive
+from warp_abtree.app.cli.arguments import PRECISION_NAMES, Parser, positive_count
 from warp_abtree.app.cli.model_commands import load_model, lod_at
 from warp_abtree.app.cli.query_command import OUTPUTS
 from warp_abtree.app.cli.report import print_result
@@ -31,21 +31,23 @@ def add_arguments(sub: Parser):
     )
     sub.add_file("--out", "-o", type=Path, required=True, metavar="DIR", help="folder to make, or to go on in")
     sub.add_argument("--output", choices=OUTPUTS, default="any", help="what to ask (any)")
-    sub.add_argument("--precision", choices=PRECISIONS, default="exact", help="as query (exact)")
+    sub.add_argument("--precision", choices=PRECISION_NAMES, default="exact", help="as query (exact)")
     for name in ("a", "b"):
         sub.add_argument(f"--lod-{name}", metavar="LOD", help=f"LOD of {name.upper()}, as query (finest)")
     sub.add_file("--lods", type=Path, metavar="LODS.npy", help="LODs of both at each pose, (p, 2)")
-    sub.add_argument("--shard", type=positive, default=65536, metavar="N", help="poses a file (65536)")
+    sub.add_argument("--shard", type=positive_count, default=65536, metavar="N", help="poses a file (65536)")
     sub.add_argument("--file", choices=("npz", "parquet"), default="npz", help="kind of the files (npz)")
     sub.add_argument(
         "--ray",
         metavar="ADDRESS",
         help='of a Ray cluster (Ray is started here). "none": this process, with --device cuda:0,cuda:1 on two',
     )
-    sub.add_argument("--workers", type=positive, metavar="N", help="Ray workers (as many as GPUs, or else CPU cores)")
+    sub.add_argument(
+        "--workers", type=positive_count, metavar="N", help="Ray workers (as many as GPUs, or else CPU cores)"
+    )
 
 
-def sweep(options, progress):
+def run_sweep(options, progress):
     """Do a sweep into shards."""
     begin = time.perf_counter()
     job = _make_job(options, progress)

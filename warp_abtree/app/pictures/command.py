@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.app.cli.arguments import Parser, positive
+from warp_abtree.app.cli.arguments import Parser, positive_count
 from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.app.open_playback import add_playback_arguments, open_playback
 from warp_abtree.app.pictures.render import import_pyvista
@@ -31,13 +31,13 @@ def add_arguments(sub: Parser):
     sub.add_file("--out", "-o", type=Path, required=True, metavar="FILE", help="PNG, or WebP or GIF, to write")
     sub.add_argument("--frame", type=int, default=0, metavar="N", help="frame of a scene to draw (0)")
     sub.add_argument("--frames", type=int, metavar="N", help="draw so many frames of a scene from there on")
-    sub.add_argument("--every", type=positive, default=1, metavar="K", help="of these, draw each K-th (1)")
+    sub.add_argument("--every", type=positive_count, default=1, metavar="K", help="of these, draw each K-th (1)")
     for name, what in (("eye", "direction to the eye"), ("up", "direction upwards")):
         sub.add_argument(f"--{name}", nargs=3, type=float, metavar=("X", "Y", "Z"), help=f"{what} (the scene's own)")
     about = "draw distances between objects: of few all, of more those whose boxes overlap"
     sub.add_argument("--distances", action="store_true", help=about)
     sub.add_argument("--world", type=int, metavar="W", help="world to draw (the scene's own)")
-    sub.add_argument("--size", type=positive, default=SIZE, metavar="PX", help=f"pixels along a side ({SIZE})")
+    sub.add_argument("--size", type=positive_count, default=SIZE, metavar="PX", help=f"pixels along a side ({SIZE})")
 
 
 def picture(options, progress):

@@ -1,4 +1,4 @@
-"""Which controller chooses the LODs of a run, from [lod]."""
+"""The table [lod] of a scene file: the controller that chooses the LODs of a run."""
 
 from dataclasses import dataclass, field, replace
 
@@ -17,7 +17,7 @@ _OPTIONS = {
 
 @dataclass(frozen=True)
 class LodControl:
-    """Which controller chooses LODs, and with what."""
+    """A controller of LODs and its settings."""
 
     controller: str = "none"  # of CONTROLLERS; "none" leaves LODs to the objects and their sweeps
     budget_ms: float | None = None  # T [ms]

@@ -241,14 +241,14 @@ class SweepTable(Table, kw_only=True):
             raise ValueError("give one of model and objects")
 
 
-Controller = Literal["predictive", "paper", "tolerance"]
+ControllerName = Literal["predictive", "paper", "tolerance"]
 Spacing = Literal["ratio", "operations"]
 
 
 class LodTable(Table):
     """[lod]: a controller chooses LODs, in the place of sweeps."""
 
-    controller: Controller | None = None  # "predictive" where a budget is given, else "tolerance"
+    controller: ControllerName | None = None  # "predictive" where a budget is given, else "tolerance"
     budget_ms: Positive | None = None  # T: selection, refinement, broad phase and query of a frame [ms]
     tolerance: NotNegative | None = None  # error of an important, still object at the eye
     steps: Annotated[int, Meta(ge=1, le=10_000)] | None = None  # levels of the LOD ladder above the coarsest
@@ -366,7 +366,7 @@ class SceneTable(Table, kw_only=True):
 
 # Keys whose values are names, and the names.
 CHOICES = {
-    "controller": get_args(Controller),
+    "controller": get_args(ControllerName),
     "spacing": get_args(Spacing),
     "shape": tuple(SHAPES),
 }

@@ -75,7 +75,7 @@ def serve(host="127.0.0.1", port=0):
             server.stop()
 
 
-def view(options, progress):
+def run_viewer(options, progress):
     """Serve a page until Ctrl-C."""
     import_viser()
     if options.port is not None or options.host != HOST:

@@ -11,7 +11,7 @@ import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.cli.report import show_number
-from warp_abtree.app.playback import HOLD, OWN
+from warp_abtree.app.playback import HOLD_MODE, OWN_MODE
 from warp_abtree.app.render_data import Settings, compose, objects_of_world
 from warp_abtree.app.styles import STAGE_LABELS
 from warp_abtree.app.toml.objects import unit
@@ -21,10 +21,10 @@ FRAME_SECONDS = 1 / 30  # between snapshots that are sent, at least
 TEXT_SECONDS = 0.2  # between changes of numbers while it plays
 BUDGETS = (0.5, 100.0)  # of the slider [ms]
 LIGHT = 0.6
-DISTANCE = 1.8  # of the first camera, in radii of what is shown
-MODES = {
-    OWN: "as the scene says",
-    HOLD: "hold as they are",
+CAMERA_DISTANCE = 1.8  # of the first camera, in radii of what is shown
+MODE_LABELS = {
+    OWN_MODE: "as the scene says",
+    HOLD_MODE: "hold as they are",
     "predictive": "budget, predicted",
     "paper": "budget, as in the paper",
     "tolerance": "tolerance",
@@ -77,7 +77,7 @@ class Page:
             buttons.on_click(lambda event: self._post(self._run_button, event.target.value))
             self._state = gui.add_markdown("")
         with gui.add_folder("Level of detail"):
-            names = [MODES[mode] for mode in playback.modes()]
+            names = [MODE_LABELS[mode] for mode in playback.modes()]
             self._mode = gui.add_dropdown("chosen", names, initial_value=names[0])
             self._on_change(self._mode, lambda _: self._choose())
             first = min(max(playback.budget_ms or 16.0, BUDGETS[0]), BUDGETS[1])
@@ -127,13 +127,13 @@ class Page:
 
     def _choose(self):
         """Choose LODs in the mode of the panel; the slider is the budget of the modes that hold one."""
-        mode = next(mode for mode in self.playback.modes() if MODES[mode] == self._mode.value)
+        mode = next(mode for mode in self.playback.modes() if MODE_LABELS[mode] == self._mode.value)
         self.playback.choose(mode, self._budget.value if mode in ("predictive", "paper") else None)
 
     def _hold_all(self, percent):
         scene = self.playback.scene
         self.playback.hold([round(percent / 100 * scene.models[model].lod_max) for model in scene.object_model])
-        self._mode.value = MODES[HOLD]
+        self._mode.value = MODE_LABELS[HOLD_MODE]
 
     # Light and camera.
 
@@ -148,7 +148,7 @@ class Page:
         """Put the first camera where it sees all that is shown."""
         first = self.server.initial_camera
         centre, radius = geometry.bounds(self.cache, self.snapshot, self.shown)
-        position = centre + DISTANCE * radius * self._eye
+        position = centre + CAMERA_DISTANCE * radius * self._eye
         first.position, first.look_at, first.up = tuple(position), tuple(centre), tuple(self._up)
         first.near, first.far = radius / 500, 200 * radius
 

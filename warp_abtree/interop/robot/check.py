@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.checks.device_memory import DeviceMemory
-from warp_abtree.interop.robot.link_query import Asked, LinkDistances, LinkHits
+from warp_abtree.interop.robot.link_query import LinkDistances, LinkHits, LinkRequest
 from warp_abtree.interop.robot.surroundings import RobotBatch
 from warp_abtree.kernels.robot.link_pairs import Parts
 from warp_abtree.query.request import CapacityError
@@ -24,8 +24,8 @@ EDGES_AT_ONCE = 1024
 STRETCHES_MAX, WIDTH_LEAST = 1024, 2.0**-30
 
 
-def ask_about(robot, robots: RobotBatch, room: int) -> Asked:
-    """Return what a chunk's query is about, with parts asked from the outermost inwards."""
+def make_link_request(robot, robots: RobotBatch, room: int) -> LinkRequest:
+    """Return the `LinkRequest` of a chunk, with parts asked from the outermost inwards."""
     description, device = robot.description, robot.device
     frame = [description.links[robot.link_names[k]] for k in robot.model_link]
     paths = [description.path(f) for f in frame]
@@ -53,7 +53,7 @@ def ask_about(robot, robots: RobotBatch, room: int) -> Asked:
     parts.radius = wp.array(np.array(radii), dtype=wp.float64, device=device)
     sizes = len(robot.joint_names), len(description.frames), len(frame)
     # A launch is one even where there is nothing to ask.
-    return Asked(description.make_chain(device), parts, stages or [(0, 0)], robots.count, room, *sizes)
+    return LinkRequest(description.make_chain(device), parts, stages or [(0, 0)], robots.count, room, *sizes)
 
 
 class RobotQuery(DeviceMemory):
@@ -66,20 +66,20 @@ class RobotQuery(DeviceMemory):
     Attributes:
         configurations: Device float64 (room, n).
         hit: Whether parts of each intersect, device uint8 (room,).
-        nearest: Of output "distance", device arrays of `kernels.robot.answers.Nearest`, else None.
+        nearest: Of output "distance", device arrays of `kernels.robot.answers.NearestParts`, else None.
     """
 
     def __init__(self, robot, around, output: str, room: int):
         self.device, self.output, self.room = robot.device, output, room
         self._robots = made = RobotBatch(around, robot.models, room, robot.device)
-        asked = ask_about(robot, made, room)
+        request = make_link_request(robot, made, room)
         self._around, self._models = made.count, len(robot.models)
         self._links: Any
         capacity = max(1, PAIRS_GUESS * room)
         if output == "distance":
-            self._links = LinkDistances(made.batch, asked, capacity)
+            self._links = LinkDistances(made.batch, request, capacity)
         else:
-            self._links = LinkHits(made.batch, asked, capacity, output == "within")
+            self._links = LinkHits(made.batch, request, capacity, output == "within")
         self.nearest = self._links.nearest
         pairs = self._links.links
         self.configurations, self._chunk = pairs.configurations, pairs.chunk

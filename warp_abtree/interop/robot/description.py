@@ -1,4 +1,4 @@
-"""What a robot's file says, whatever its format: frames and their joints, links, parts, and pairs never tested."""
+"""Description of a robot, whatever its file format: frames and joints, links, parts, and pairs never tested."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -9,9 +9,9 @@ import warp as wp
 
 from warp_abtree.kernels.robot import forward
 from warp_abtree.model.mesh import Mesh, load_mesh
+from warp_abtree.scene.objects import ALL_BITS
 
-KINDS = {"fixed": int(forward.FIXED), "revolute": int(forward.REVOLUTE), "prismatic": int(forward.PRISMATIC)}
-ALL_BITS = 2**32 - 1
+JOINT_KINDS = {"fixed": int(forward.FIXED), "revolute": int(forward.REVOLUTE), "prismatic": int(forward.PRISMATIC)}
 
 
 class RobotError(ValueError):
@@ -19,7 +19,7 @@ class RobotError(ValueError):
 
 
 @dataclass
-class Frame:
+class RobotFrame:
     """A frame: its parent's, moved by a fixed transform, then by a joint.
 
     Attributes:
@@ -66,7 +66,7 @@ class Description:
             the root, "none".
     """
 
-    frames: list[Frame] = field(default_factory=list)
+    frames: list[RobotFrame] = field(default_factory=list)
     joints: dict[str, tuple[float, float]] = field(default_factory=dict)
     links: dict[str, int] = field(default_factory=dict)
     parts: list[Part] = field(default_factory=list)
@@ -129,7 +129,7 @@ class Description:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         chain.parent = upload(np.array([frame.parent for frame in frames], np.int32), wp.int32)
-        chain.kind = upload(np.array([KINDS[frame.kind] for frame in frames], np.int32), wp.int32)
+        chain.kind = upload(np.array([JOINT_KINDS[frame.kind] for frame in frames], np.int32), wp.int32)
         moved = [-1 if frame.joint is None else columns[frame.joint] for frame in frames]
         chain.column = upload(np.array(moved, np.int32), wp.int32)
         chain.scale = upload(np.array([frame.scale for frame in frames]), wp.float64)

@@ -15,12 +15,16 @@ from warp_abtree.query.request import Buffers
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
 
-MODES = {"any": int(link_pairs.ANY), "within": int(link_pairs.WITHIN), "distance": int(link_pairs.DISTANCE)}
+CHECK_MODES = {
+    "any": int(link_pairs.ASK_ANY),
+    "within": int(link_pairs.ASK_WITHIN),
+    "distance": int(link_pairs.ASK_DISTANCE),
+}
 
 
 @dataclass
-class Asked:
-    """What a chunk's query is about: a robot's chain and parts, and the objects of the batch.
+class LinkRequest:
+    """Request of a chunk's query: a robot's chain and parts, and the objects of the batch.
 
     Attributes:
         stages: (first, end) of the entries of `parts` that are asked one after the other.
@@ -41,7 +45,7 @@ class Asked:
 
 
 class LinkPairs:
-    """Stands in the place of a `BroadPhase`: poses parts by their configurations, and finds the pairs of a stage.
+    """Broad phase of a robot's parts: poses them by their configurations, and finds the pairs of a stage.
 
     Attributes:
         pairs, pair_count, guard, wide: As of `BroadPhase`; a pair names a part first.
@@ -56,28 +60,28 @@ class LinkPairs:
     wide = 0.0
     pairs: wp.array
 
-    def __init__(self, query, asked: Asked, mode: int, capacity: int):
-        self.query, self.asked, self.mode, self.batch = query, asked, mode, query.batch
+    def __init__(self, query, request: LinkRequest, mode: int, capacity: int):
+        self.query, self.request, self.mode, self.batch = query, request, mode, query.batch
         self.device = device = self.batch.device
-        self.active = asked.room
-        room, frames, count = asked.room, forward.Frames(), self.batch.object_count
+        self.active = request.room
+        room, frames, count = request.room, forward.Frames(), self.batch.object_count
 
         def make(dtype, shape):
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        frames.rotation, frames.position = (make(t, (room, asked.frame_count)) for t in (wp.mat33d, wp.vec3d))
+        frames.rotation, frames.position = (make(t, (room, request.frame_count)) for t in (wp.mat33d, wp.vec3d))
         self.frames, self.lower, self.upper = frames, make(wp.vec3, count), make(wp.vec3, count)
-        self.configurations = make(wp.float64, (room, asked.width))
+        self.configurations = make(wp.float64, (room, request.width))
         self.chunk = chunk = link_pairs.Chunk()
-        spread = (room, asked.width) if mode == MODES["within"] else (0, 0)
+        spread = (room, request.width) if mode == CHECK_MODES["within"] else (0, 0)
         chunk.count, chunk.half, chunk.size = make(wp.int32, 1), make(wp.float64, spread), make(wp.float64, spread)
         chunk.hit = make(wp.uint8, room)
-        chunk.near = make(wp.uint8, room if mode == MODES["within"] else 0)
-        chunk.best = make(wp.float64, room if mode == MODES["distance"] else 0)
+        chunk.near = make(wp.uint8, room if mode == CHECK_MODES["within"] else 0)
+        chunk.best = make(wp.float64, room if mode == CHECK_MODES["distance"] else 0)
         self._no_reach, self._no_distance = make(wp.vec4d, 0), make(wp.float64, 0)
         self.pair_count = make(wp.int32, 1)
         self.pairs = wp.empty(capacity, dtype=wp.vec2i, device=device)
-        self.bvh = wp.Bvh(self.lower[: asked.around], self.upper[: asked.around]) if asked.around else None
+        self.bvh = wp.Bvh(self.lower[: request.around], self.upper[: request.around]) if request.around else None
 
     def make_room(self, pairs: wp.array) -> list:
         """Return (owner, attribute, new array) of a list of pairs."""
@@ -85,13 +89,13 @@ class LinkPairs:
 
     def place(self):
         """Pose the parts of all configurations, and box all objects. Launches only."""
-        asked, pools, device = self.asked, self.batch.pools, self.device
-        inputs = [asked.chain, self.configurations, self.frames]
+        request, pools, device = self.request, self.batch.pools, self.device
+        inputs = [request.chain, self.configurations, self.frames]
         wp.launch(forward.forward_kernel, self.active, inputs, device=device)
-        inputs = [asked.around, asked.parts.frame, self.frames, pools[2]]
-        wp.launch(forward.place_part_kernel, (self.active, asked.part_count), inputs, device=device)
+        inputs = [request.around, request.parts.frame, self.frames, pools[2]]
+        wp.launch(forward.place_part_kernel, (self.active, request.part_count), inputs, device=device)
         inputs = [*pools, self.guard.record(), 0.0, self._no_reach, self.lower, self.upper]
-        wp.launch(pose_box_kernel, asked.around + self.active * asked.part_count, inputs, device=device)
+        wp.launch(pose_box_kernel, request.around + self.active * request.part_count, inputs, device=device)
         if self.bvh is not None:
             self.bvh.rebuild()
         self.chunk.hit.zero_()
@@ -99,14 +103,14 @@ class LinkPairs:
 
     def launch(self, stage: tuple[int, int]):
         """Find the pairs of a stage. Launches only."""
-        asked, distances = self.asked, self._no_distance
-        if self.mode == MODES["within"]:
+        request, distances = self.request, self._no_distance
+        if self.mode == CHECK_MODES["within"]:
             distances = self.query.within
-        elif self.mode == MODES["distance"]:
+        elif self.mode == CHECK_MODES["distance"]:
             distances = self.query.beyond
         self.pair_count.zero_()
         bvh = wp.uint64(0) if self.bvh is None else self.bvh.id
-        inputs = [self.mode, wp.vec2i(*stage), asked.around, bvh, asked.chain, asked.parts, self.frames]
+        inputs = [self.mode, wp.vec2i(*stage), request.around, bvh, request.chain, request.parts, self.frames]
         inputs += [self.lower, self.upper, self.chunk, self.pair_count, self.pairs, distances]
         wp.launch(link_pairs.find_link_pair_kernel, self.active, inputs, device=self.device)
 
@@ -121,13 +125,13 @@ class StagedQuery(Query):
 
     links: LinkPairs
 
-    def _prepare(self, batch: Batch, asked: Asked, mode: str):
-        self.asked, self.asked_mode = asked, MODES[mode]
-        self.nearest: Any = None  # `answers.Nearest`, where distances are asked
+    def _prepare(self, batch: Batch, request: LinkRequest, mode: str):
+        self.request, self.mode = request, CHECK_MODES[mode]
+        self.nearest: Any = None  # `answers.NearestParts`, where distances are asked
         self.demand = wp.zeros(2, dtype=wp.int32, device=batch.device)
 
     def _make_broad_phase(self, capacity, sorts):
-        self.links = LinkPairs(self, self.asked, self.asked_mode, capacity)
+        self.links = LinkPairs(self, self.request, self.mode, capacity)
         return self.links
 
     def _fill_within(self):
@@ -136,7 +140,7 @@ class StagedQuery(Query):
     def _launch(self, between=None):
         self.demand.zero_()
         self.links.place()
-        for stage in self.asked.stages:
+        for stage in self.request.stages:
             self.links.launch(stage)
             self.prove_apart()
             self.traverse()
@@ -166,15 +170,15 @@ class StagedQuery(Query):
 class LinkHits(StagedQuery):
     """Which configurations have parts that intersect; with proofs, also which have all proved apart by a reach."""
 
-    def __init__(self, batch: Batch, asked: Asked, capacity: int, proves: bool):
-        self._prepare(batch, asked, "within" if proves else "any")
+    def __init__(self, batch: Batch, request: LinkRequest, capacity: int, proves: bool):
+        self._prepare(batch, request, "within" if proves else "any")
         self._no_near = wp.empty(0, dtype=wp.int32, device=batch.device)
         super().__init__(batch, "any", capacity=Buffers(pairs=capacity), within=0.0 if proves else None)
 
     def _note(self):
         near = self._no_near if self.near is None else self.near.any_hit
-        links, asked = self.links, self.asked
-        inputs = [asked.around, asked.part_count, self.pair_count, self.pairs, self.hits, near, links.chunk]
+        links, request = self.links, self.request
+        inputs = [request.around, request.part_count, self.pair_count, self.pairs, self.hits, near, links.chunk]
         inputs.append(self.demand)
         wp.launch(answers.note_hit_kernel, len(self.pairs), inputs, device=self.device)
 
@@ -182,10 +186,10 @@ class LinkHits(StagedQuery):
 class LinkDistances(DistanceQuery, StagedQuery):
     """How far apart the nearest parts of each configuration are, or a part and its surroundings, and where."""
 
-    def __init__(self, batch: Batch, asked: Asked, capacity: int):
-        self._prepare(batch, asked, "distance")
+    def __init__(self, batch: Batch, request: LinkRequest, capacity: int):
+        self._prepare(batch, request, "distance")
         self.most = np.inf
-        self.nearest = nearest = answers.Nearest()
+        self.nearest = nearest = answers.NearestParts()
         for name, dtype in (
             ("winner", wp.int64),
             ("distance", wp.float64),
@@ -193,7 +197,7 @@ class LinkDistances(DistanceQuery, StagedQuery):
             ("faces", wp.vec2i),
             ("pair", wp.vec2i),
         ):
-            setattr(nearest, name, wp.empty(asked.room, dtype=dtype, device=batch.device))
+            setattr(nearest, name, wp.empty(request.room, dtype=dtype, device=batch.device))
         super().__init__(batch, capacity=Buffers(pairs=capacity))
 
     @property
@@ -211,10 +215,10 @@ class LinkDistances(DistanceQuery, StagedQuery):
         super()._launch(between)
 
     def _note(self):
-        links, asked = self.links, self.asked
+        links, request = self.links, self.request
         nearest: Any = self.nearest
         nearest.winner.fill_(int(answers.NO_PAIR))
-        given = [asked.around, asked.part_count, self.pair_count, self.pairs]
+        given = [request.around, request.part_count, self.pair_count, self.pairs]
         for kernel, inputs in (
             (answers.note_distance_kernel, [self.hits, self.distances, links.chunk, self.demand]),
             (answers.find_winner_kernel, [self.distances, links.chunk, nearest]),

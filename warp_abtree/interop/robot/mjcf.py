@@ -10,9 +10,9 @@ import numpy as np
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.interop.robot.description import (
     Description,
-    Frame,
     Part,
     RobotError,
+    RobotFrame,
     check_names,
     join_meshes,
     unit_axis,
@@ -21,7 +21,7 @@ from warp_abtree.interop.robot.urdf import INSTALL
 from warp_abtree.model.files.found import MeshError, Remarks, Surface
 from warp_abtree.model.files.read import read_file, split_file_name
 
-KINDS = {"hinge": "revolute", "slide": "prismatic"}
+MJCF_JOINTS = {"hinge": "revolute", "slide": "prismatic"}
 VISUAL_GROUPS = 3  # MuJoCo shows geoms of the groups below
 
 
@@ -67,7 +67,7 @@ def _joint_values(mujoco, model, path) -> list[tuple[str, float, float]]:
     values, leads = [(name, 1.0, 0.0) for name in names], {}
     for j, name in enumerate(names):
         kind = mujoco.mjtJoint(int(model.jnt_type[j])).name[len("mjJNT_") :].lower()
-        if kind not in KINDS:
+        if kind not in MJCF_JOINTS:
             raise RobotError(f"{path}: joint {name!r} is {kind}; hinge and slide ones are supported")
     for e, kind in _equalities(mujoco, model):
         if kind != "joint":
@@ -154,13 +154,13 @@ def _add_body(mujoco, model, b, description, names, values, path) -> int:
         anchor = model.jnt_pos[j]
         joint, scale, offset = values[j]
         start = float(model.qpos0[model.jnt_qposadr[j]])
-        kind = KINDS[mujoco.mjtJoint(int(model.jnt_type[j])).name[len("mjJNT_") :].lower()]
+        kind = MJCF_JOINTS[mujoco.mjtJoint(int(model.jnt_type[j])).name[len("mjJNT_") :].lower()]
         axis = unit_axis(model.jnt_axis[j], f"{path}: joint {j}")
-        frame = Frame(parent, origin, kind, axis, joint or None, scale, offset - start)
+        frame = RobotFrame(parent, origin, kind, axis, joint or None, scale, offset - start)
         description.frames.append(frame)
         parent, origin = len(description.frames) - 1, np.eye(4)
     if anchor.any() or not model.body_jntnum[b]:
-        description.frames.append(Frame(parent, origin @ _shift(-anchor)))
+        description.frames.append(RobotFrame(parent, origin @ _shift(-anchor)))
     return len(description.frames) - 1
 
 

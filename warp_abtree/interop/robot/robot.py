@@ -31,7 +31,7 @@ from warp_abtree.state.batch import check_pairs
 
 ENDINGS = {".urdf": read_urdf, ".xml": read_mjcf, ".mjcf": read_mjcf}
 # Configurations of a launch: fewer where few are given.
-CHUNKS = {"cpu": (16, 256, 4096), "cuda": (1024, 8192, 65536)}
+ROOMS = {"cpu": (16, 256, 4096), "cuda": (1024, 8192, 65536)}
 # Stretches of an edge at a time, for the room of a chunk.
 STRETCHES = 16
 KEPT = 4  # surroundings whose arrays stay on the device
@@ -269,11 +269,11 @@ class Robot:
             raise ValueError(f"{what}: shape {tuple(rows.shape)}, not (c, {width}), a value of each joint")
         if len(rows) == 0:
             return wp.empty((0, width), dtype=wp.float64, device=self.device)
-        first = wp.full(1, int(forward.NONE_REFUSED), dtype=wp.int64, device=self.device)
+        first = wp.full(1, int(forward.NO_BAD_NUMBER), dtype=wp.int64, device=self.device)
         inputs = [int(limits), len(rows), self._chain, rows, first]
         wp.launch(forward.check_configuration_kernel, len(rows), inputs, device=self.device)
         bad = int(first.numpy()[0])
-        if bad != int(forward.NONE_REFUSED):
+        if bad != int(forward.NO_BAD_NUMBER):
             self._refuse(rows, *divmod(bad, width), what)
         return rows
 
@@ -290,7 +290,7 @@ class Robot:
         """Return a query of a room for a number of configurations: the one of before if it is of the same."""
         around, key = make_surroundings(world, self.device)
         key = (*key, check_pairs(self.pairs, len(self.models)).tobytes(), tuple(self.mounted))
-        rooms = CHUNKS["cpu" if self.device.is_cpu else "cuda"]
+        rooms = ROOMS["cpu" if self.device.is_cpu else "cuda"]
         room = next((room for room in rooms if room >= count), rooms[-1])
         query = self._kept.pop((key, output, room), None)
         if query is None or not query.is_of(around):

@@ -1,4 +1,4 @@
-"""What surrounds a robot: the objects of a scene, or models; and the batch of them and of a chunk's robots."""
+"""Surroundings of a robot: objects of a scene or models, in one batch with the robots of a chunk."""
 
 import numpy as np
 import warp as wp

@@ -14,9 +14,9 @@ import numpy as np
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.interop.robot.description import (
     Description,
-    Frame,
     Part,
     RobotError,
+    RobotFrame,
     check_names,
     check_rigid,
     join_meshes,
@@ -25,7 +25,7 @@ from warp_abtree.interop.robot.description import (
 from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.mesh import MeshError, load_mesh
 
-KINDS = {"fixed": "fixed", "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+URDF_JOINTS = {"fixed": "fixed", "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 # Those of pairs, and what says nothing of them.
 SRDF_TAGS = (
     *("disable_collisions", "enable_collisions", "disable_default_collisions", "group", "group_state", "end_effector"),
@@ -84,7 +84,7 @@ def read_urdf(path: Path, geometry: str) -> Description:
 
 def _check_joint(joint, joints, names, path):
     where = f"{path}: joint {joint.name!r}"
-    if joint.type not in KINDS:
+    if joint.type not in URDF_JOINTS:
         raise RobotError(f"{where} is {joint.type}; fixed, revolute, continuous and prismatic ones are supported")
     for end in (joint.parent, joint.child):
         if end not in names:
@@ -136,10 +136,11 @@ def _add_link(name, description, joints, values, path):
         above[name] = None
         name = joints[name].parent if name in joints else None
     for link in reversed(above):
-        frame, joint = Frame(-1, np.eye(4)), joints.get(link)
+        frame, joint = RobotFrame(-1, np.eye(4)), joints.get(link)
         if joint is not None:
             where = f"{path}: joint {joint.name!r}"
-            frame = Frame(description.links[joint.parent], check_rigid(joint.origin, where), KINDS[joint.type])
+            origin = check_rigid(joint.origin, where)
+            frame = RobotFrame(description.links[joint.parent], origin, URDF_JOINTS[joint.type])
             if joint.type != "fixed":
                 frame.joint, frame.scale, frame.offset = values[joint.name]
                 frame.axis = unit_axis((1.0, 0.0, 0.0) if joint.axis is None else joint.axis, where)
