@@ -1,4 +1,4 @@
-"""What distances of faces err by in float32, what coordinates add to that, and what brackets are widened by."""
+"""Error bounds of distances in float32: arithmetic, coordinates, and the slack of brackets."""
 
 import numpy as np
 import warp as wp

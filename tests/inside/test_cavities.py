@@ -1,4 +1,4 @@
-"""Which way closed parts of one mesh face: winding numbers by exact rays are 1 in what parity calls inside, else 0."""
+"""Orientation of closed parts of one mesh: winding numbers by exact rays are 1 in what parity calls inside, else 0."""
 
 from fractions import Fraction
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.interop.usd import read_usd
-from warp_abtree.model.files.found import Remarks, Surface
+from warp_abtree.model.files.found import FileSurface, Remarks
 from warp_abtree.model.files.read import USD, read_file, split_file_name
 from warp_abtree.model.mesh import MeshError, load_mesh
 from warp_abtree.model.model import Model
@@ -105,7 +105,7 @@ def scene_from_file(path, device=None, base_faces=10, progress=None):
     name, kind, _ = split_file_name(path)
     found = read_usd(path, remarks) if kind in USD and path.is_file() else read_file(path, remarks)
     try:
-        source = found.as_scene(name) if isinstance(found, Surface) else found
+        source = found.as_scene(name) if isinstance(found, FileSurface) else found
         made = scene_from_trimesh(source, device, base_faces, progress)
     except MeshError as error:
         raise MeshError(f"{path}: {error}" + (f" ({remarks})" if str(remarks) else "")) from None

@@ -11,7 +11,7 @@ import numpy as np
 
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.kernels.base.poses import COORDINATE_MIN
-from warp_abtree.model.files.found import MeshError, Remarks, Surface
+from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
 from warp_abtree.model.files.read import read_file, split_file_name
 from warp_abtree.model.files.usd_mesh import read_warp_asset
 from warp_abtree.model.winding import component_labels, find_winding, keep_outside
@@ -78,7 +78,7 @@ def load_mesh(source, name=None):
     remarks = Remarks()
     found = read_file(path, remarks)
     name = split_file_name(path)[0] if name is None else name
-    if isinstance(found, Surface):
+    if isinstance(found, FileSurface):
         mesh = _weld_mesh(found.vertices, found.faces, name, where=str(path))
         mesh = replace(mesh, parts=1 if found.parts is None else len(np.unique(found.parts)))
     else:

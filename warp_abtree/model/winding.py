@@ -29,7 +29,7 @@ VOLUME_ROUNDING = 2.0**-45
 SAMPLED_FACES = 16
 TABLE = 2**22
 # Points as near to a surface count as on it, as a part of its size, and of coordinates.
-NEAR, NEAR_ROUNDING = 1e-9, 2.0**-48
+NEAR_FRACTION, NEAR_ROUNDING = 1e-9, 2.0**-48
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,7 +290,7 @@ def _exact_volume(a, b, c) -> Fraction:
 
 def _nearness(lower, upper):
     """Return how near to a surface in a box counts as on it."""
-    return max(NEAR * (upper - lower).max(), NEAR_ROUNDING * max(np.abs(lower).max(), np.abs(upper).max()))
+    return max(NEAR_FRACTION * (upper - lower).max(), NEAR_ROUNDING * max(np.abs(lower).max(), np.abs(upper).max()))
 
 
 def _holds(corners, points) -> bool:

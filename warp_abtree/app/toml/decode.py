@@ -7,11 +7,11 @@ from pathlib import Path
 from warp_abtree.app.toml.errors import SceneError, fail
 from warp_abtree.app.toml.folder import scene_names
 
-SIZE_LIMIT = 2**24  # bytes of a file
+FILE_SIZE_LIMIT = 2**24  # bytes of a file
 DEPTH_LIMIT = 16  # of tables and lists in one another
 DOT_LIMIT = 1000  # in a key: the parser takes the square of their number
 NO_SCENE = "is no scene file, which is TOML (.toml); info, query, view and picture take meshes and models"
-TYPES = {
+TOML_TYPES = {
     "object": "a table",
     "array": "a list",
     "str": "a string",
@@ -69,7 +69,7 @@ def _parse(path, msgspec, text: str | None):
     """Return the TOML of a file, or of `text` in its place, as dictionaries and lists."""
     if text is None:
         with open(path, "rb") as file:
-            text = file.read(SIZE_LIMIT + 1).decode()
+            text = file.read(FILE_SIZE_LIMIT + 1).decode()
     _check_text(path, text)
     try:
         return msgspec.toml.decode(text)
@@ -79,8 +79,8 @@ def _parse(path, msgspec, text: str | None):
 
 def _check_text(path, text: str):
     """Refuse what the parser would take too long for."""
-    if len(text) > SIZE_LIMIT:
-        fail(path, "the file", f"has more than {SIZE_LIMIT:,} bytes")
+    if len(text) > FILE_SIZE_LIMIT:
+        fail(path, "the file", f"has more than {FILE_SIZE_LIMIT:,} bytes")
     for number, line in enumerate(text.splitlines(), start=1):
         parts = line.partition("#")[0].replace(",", "=").split("=")
         if max(part.count(".") for part in parts) > DOT_LIMIT:
@@ -135,4 +135,4 @@ def _explain(error: str, where: str, choices: dict) -> tuple[str, str]:
 
 def _in_toml(types: str) -> str:
     """Return types of msgspec, as "int | null", in the words of TOML."""
-    return " or ".join(TYPES.get(name, name) for name in types.split(" | ") if name != "null")
+    return " or ".join(TOML_TYPES.get(name, name) for name in types.split(" | ") if name != "null")

@@ -14,7 +14,7 @@ from warp_abtree.app.toml.shapes import FACE_BOUNDS, GENERATED
 from warp_abtree.model.mesh import Mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model
 
-FACE_LIMIT = 2**22  # of all models of a file that are generated; a face takes 1 KB while a model is built
+SCENE_FACE_LIMIT = 2**22  # of all models of a file that are generated; a face takes 1 KB while a model is built
 
 
 def check_faces(path: Path, tables: dict):
@@ -32,9 +32,9 @@ def check_faces(path: Path, tables: dict):
         made = 0 if shape is None else FACE_BOUNDS[shape](**table.parameters())
         made = max(made, table.faces or 0)
         total += made
-        if total > FACE_LIMIT:
+        if total > SCENE_FACE_LIMIT:
             among = "" if total == made else f", {total:,} with those of the models before"
-            fail(path, f"models.{name}", f"asks for {made:,} faces{among}; a file may generate {FACE_LIMIT:,}")
+            fail(path, f"models.{name}", f"asks for {made:,} faces{among}; a file may generate {SCENE_FACE_LIMIT:,}")
 
 
 def build_model(path: Path, name: str, table, progress=None) -> Model:
@@ -95,8 +95,8 @@ def _find_source(names, folder, has_shape):
 def _bring_to(mesh, faces, progress):
     """Return a mesh of that many faces, or one less: smoothed by Loop subdivision if need be, then collapsed."""
     rounds = math.ceil(math.log(faces / len(mesh.faces), 4)) if len(mesh.faces) < faces else 0
-    if rounds and len(mesh.faces) * 4**rounds > FACE_LIMIT:
-        most = len(mesh.faces) * 4 ** math.floor(math.log(FACE_LIMIT / len(mesh.faces), 4))
+    if rounds and len(mesh.faces) * 4**rounds > SCENE_FACE_LIMIT:
+        most = len(mesh.faces) * 4 ** math.floor(math.log(SCENE_FACE_LIMIT / len(mesh.faces), 4))
         raise ValueError(f"faces: Loop subdivision of {len(mesh.faces):,} faces reaches {most:,} at most")
     vertices = mesh.vertices
     corners = np.delete(mesh.faces, mesh.dropped_faces, axis=0)

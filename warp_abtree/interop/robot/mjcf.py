@@ -18,7 +18,7 @@ from warp_abtree.interop.robot.description import (
     unit_axis,
 )
 from warp_abtree.interop.robot.urdf import INSTALL
-from warp_abtree.model.files.found import MeshError, Remarks, Surface
+from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
 from warp_abtree.model.files.read import read_file, split_file_name
 
 MJCF_JOINTS = {"hinge": "revolute", "slide": "prismatic"}
@@ -239,7 +239,7 @@ def _recut(model, m, vertices, faces, where):
     except MeshError as error:
         raise RobotError(f"{where}: {first_line(error)}") from None
     polygons = sum(line.split(maxsplit=1)[:1] == [b"f"] for line in path.read_bytes().splitlines())
-    if not isinstance(found, Surface) or len(found.faces) <= polygons:
+    if not isinstance(found, FileSurface) or len(found.faces) <= polygons:
         return faces
     # MuJoCo scales, turns and shifts the vertices, and keeps their order.
     apart, to = math.inf, np.eye(4)[:, :3]

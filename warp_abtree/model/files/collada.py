@@ -9,7 +9,7 @@ from warp_abtree.model.files.found import MeshError, Remarks
 from warp_abtree.model.files.polygons import triangulate
 
 # What tells errors of pycollada that concern no shapes.
-LOOKS = ("effect", "material", "image", "surface", "sampler", "texture", "camera", "light", "animation")
+COLLADA_LOOKS = ("effect", "material", "image", "surface", "sampler", "texture", "camera", "light", "animation")
 
 
 def read_collada(data: bytes, where: str, remarks: Remarks):
@@ -29,7 +29,7 @@ def read_collada(data: bytes, where: str, remarks: Remarks):
     except Exception as error:  # XML, or whatever goes wrong inside the parser
         raise MeshError(f"{where}: cannot be read as dae: {first_line(error)}") from None
     for broken in map(first_line, file.errors):
-        if not any(word in broken.lower() for word in LOOKS):
+        if not any(word in broken.lower() for word in COLLADA_LOOKS):
             remarks.add("left out what is broken:", broken)
     for geometry in file.geometries:
         if geometry.xmlnode is not None and any(str(node.tag).endswith("}ph") for node in geometry.xmlnode.iter()):

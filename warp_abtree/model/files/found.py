@@ -1,4 +1,4 @@
-"""What the readers of mesh files return, and the error that they raise."""
+"""Surfaces that readers of mesh files return, their remarks, and the error that they raise."""
 
 import inspect
 import warnings
@@ -43,7 +43,7 @@ class Remarks:
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class FileSurface:
     """Triangles over one list of vertices, in the order of their file.
 
     Attributes:

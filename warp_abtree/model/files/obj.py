@@ -4,7 +4,7 @@ import codecs
 
 import numpy as np
 
-from warp_abtree.model.files.found import MeshError, Remarks, Surface
+from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
 from warp_abtree.model.files.polygons import triangulate
 
 # How lines of plain OBJ files begin; in others, a `v` or `f` might stand behind a tab, say.
@@ -13,7 +13,7 @@ LEFT_OUT = {b"p": "points", b"l": "lines", b"curv": "curves", b"curv2": "curves"
 LEFT_OUT |= {b"call": "called files"}
 
 
-def _parse_plain_obj(data) -> Surface | None:
+def _parse_plain_obj(data) -> FileSurface | None:
     """Return what an OBJ file holds where each `v` has three numbers and each `f` three plain indices.
 
     None for any other file, and for one that has mistakes.
@@ -31,7 +31,7 @@ def _parse_plain_obj(data) -> Surface | None:
         if line[:2] == b"o ":
             parts.begin(line, count)
         count += line[:2] == b"f "
-    return Surface(points, corners - 1, *parts.of(np.ones(count, int)))
+    return FileSurface(points, corners - 1, *parts.of(np.ones(count, int)))
 
 
 def _plain_triples(rows, number) -> np.ndarray | None:
@@ -67,7 +67,7 @@ class _Parts:
         return tuple(self.names), np.repeat(parts, triangle_counts)
 
 
-def read_obj(data: bytes, where: str, remarks: Remarks) -> Surface:
+def read_obj(data: bytes, where: str, remarks: Remarks) -> FileSurface:
     """Return what an OBJ file holds; raise MeshError with the line that cannot be read."""
     data = data.removeprefix(codecs.BOM_UTF8)
     plain = _parse_plain_obj(data)
@@ -113,4 +113,4 @@ def read_obj(data: bytes, where: str, remarks: Remarks) -> Surface:
     except OverflowError:
         raise MeshError(f"{where}: a face refers to vertex {max(corners)}, but there are {len(points)}") from None
     polygons = np.array(counts)
-    return Surface(points, triangulate(points, polygons, indices, where), *parts.of(polygons - 2))
+    return FileSurface(points, triangulate(points, polygons, indices, where), *parts.of(polygons - 2))

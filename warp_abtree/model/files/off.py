@@ -4,11 +4,11 @@ import re
 
 import numpy as np
 
-from warp_abtree.model.files.found import MeshError, Remarks, Surface
+from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
 from warp_abtree.model.files.polygons import triangulate
 
 
-def read_off(data: bytes, where: str, remarks: Remarks) -> Surface:
+def read_off(data: bytes, where: str, remarks: Remarks) -> FileSurface:
     """Return what an OFF file holds; raise MeshError where it is damaged, binary, or not of three dimensions."""
     # Numbers may stand right behind the keyword.
     keyword = re.match(rb"\s*(?:#[^\n]*\s+)*(?:ST)?C?N?(4?n?)OFF(?![A-Za-z])[ \t]*(BINARY)?", data)
@@ -54,4 +54,4 @@ def read_off(data: bytes, where: str, remarks: Remarks) -> Surface:
         text = b" ".join(row).decode(errors="replace")
         raise MeshError(f"{where}: line {number} cannot be read: {text[:60]}") from None
     points = np.array(vertices, np.float64).reshape(-1, 3)
-    return Surface(points, triangulate(points, np.array(counts), indices, where))
+    return FileSurface(points, triangulate(points, np.array(counts), indices, where))

@@ -6,14 +6,14 @@ from typing import Literal
 
 import numpy as np
 
-from warp_abtree.model.files.found import MeshError, Remarks, Surface
+from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
 from warp_abtree.model.files.polygons import cut_strip, triangulate
 
-TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
-TYPES |= {"double": "f8"} | {
+PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
+PLY_TYPES |= {"double": "f8"} | {
     f"{kind}{8 * size}": f"{kind[0]}{size}" for kind in ("int", "uint") for size in (1, 2, 4, 8)
 }
-TYPES |= {"float16": "f2", "float32": "f4", "float64": "f8"}
+PLY_TYPES |= {"float16": "f2", "float32": "f4", "float64": "f8"}
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 CORNERS = ("vertex_indices", "vertex_index")
 
@@ -37,7 +37,7 @@ class _Element:
         return name in "xyz" if self.name == "vertex" else name == self.corners()
 
 
-def read_ply(data: bytes, where: str, remarks: Remarks) -> Surface:
+def read_ply(data: bytes, where: str, remarks: Remarks) -> FileSurface:
     """Return what a PLY file holds; raise MeshError where it is damaged or holds no faces."""
     order, elements, start = _read_header(data, where)
     table = _read_text if order == "" else _read_binary
@@ -69,7 +69,7 @@ def read_ply(data: bytes, where: str, remarks: Remarks) -> Surface:
                 faces += [cut_strip(strip) for strip in _strips(counts, corners)]
     if not faces:
         raise MeshError(f"{where}: no faces (it holds {', '.join(e.name for e in elements if e.count) or 'nothing'})")
-    return Surface(vertices, np.concatenate(faces))
+    return FileSurface(vertices, np.concatenate(faces))
 
 
 def _strips(counts, corners):
@@ -95,11 +95,11 @@ def _read_header(data, where):
                 case ["element", name, count]:
                     elements.append(_Element(name, int(count)))
                 case ["property", "list", length, kind, name]:
-                    if TYPES[length][0] == "f":
+                    if PLY_TYPES[length][0] == "f":
                         raise ValueError
-                    elements[-1].properties[name] = (TYPES[length], TYPES[kind])
+                    elements[-1].properties[name] = (PLY_TYPES[length], PLY_TYPES[kind])
                 case ["property", kind, name]:
-                    elements[-1].properties[name] = (None, TYPES[kind])
+                    elements[-1].properties[name] = (None, PLY_TYPES[kind])
                 case [] | ["comment" | "obj_info", *_]:
                     pass
                 case _:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.model.files.collada import read_collada
-from warp_abtree.model.files.found import MeshError, Remarks, Surface
+from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
 from warp_abtree.model.files.gltf import read_gltf
 from warp_abtree.model.files.obj import read_obj
 from warp_abtree.model.files.off import read_off
@@ -35,7 +35,7 @@ def split_file_name(path: Path) -> tuple[str, str, bool]:
 
 
 def read_file(path: Path, remarks: Remarks):
-    """Return a `Surface` of a file with one list of vertices; of any other format a trimesh.Scene.
+    """Return a `FileSurface` of a file with one list of vertices; of any other format a trimesh.Scene.
 
     Raises:
         MeshError: The file is missing, damaged, of an unknown format, or holds what cannot be read.
@@ -122,7 +122,7 @@ def _read_archive(archive, where, remarks):
             remarks.add("left out", name)
         elif kind in trimesh.available_formats() or kind in NEEDED:
             found = _read_data(data, kind, f"{where}: {name}", resolver, remarks)
-            scene = found.as_scene(stem) if isinstance(found, Surface) else found
+            scene = found.as_scene(stem) if isinstance(found, FileSurface) else found
             for node in scene.graph.nodes_geometry:
                 pose, part = scene.graph[node]
                 title = trimesh.util.unique_name(node, merged.graph.nodes)

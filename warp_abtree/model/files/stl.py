@@ -2,35 +2,35 @@
 
 import numpy as np
 
-from warp_abtree.model.files.found import MeshError, Remarks, Surface
+from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
 
 FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-HEADER = 84  # bytes of text and count
+STL_HEADER = 84  # bytes of text and count
 
 
-def read_stl(data: bytes, where: str, remarks: Remarks) -> Surface:
+def read_stl(data: bytes, where: str, remarks: Remarks) -> FileSurface:
     """Return what an STL file holds, a part a solid; raise MeshError where it is neither text nor binary."""
-    whole = len(data) >= HEADER and len(data) == HEADER + FACET.itemsize * _facet_count(data)
+    whole = len(data) >= STL_HEADER and len(data) == STL_HEADER + FACET.itemsize * _facet_count(data)
     if not whole and data.lstrip()[:5].lower() == b"solid" and b"\0" not in data:
         return _read_text(data, where, remarks)
-    if len(data) < HEADER:
+    if len(data) < STL_HEADER:
         raise MeshError(f"{where}: cannot be read as stl: {len(data)} bytes, and no text that begins with 'solid'")
-    count, there = _facet_count(data), (len(data) - HEADER) // FACET.itemsize
+    count, there = _facet_count(data), (len(data) - STL_HEADER) // FACET.itemsize
     if not whole:
         if min(count, there) == 0:
             raise MeshError(f"{where}: no faces: its header declares {count:,} facets, and {there:,} would fit")
         if there < count:
             remarks.add("cut short:", f"{there:,} facets are read of the {count:,} that its header declares")
         else:
-            more = len(data) - HEADER - FACET.itemsize * count
+            more = len(data) - STL_HEADER - FACET.itemsize * count
             remarks.add("left out", f"{more:,} bytes behind the {count:,} facets that its header declares")
-    corners = np.frombuffer(data, FACET, min(count, there), HEADER)["corners"]
+    corners = np.frombuffer(data, FACET, min(count, there), STL_HEADER)["corners"]
     vertices = corners.reshape(-1, 3).astype(np.float64)
-    return Surface(vertices, np.arange(len(vertices)).reshape(-1, 3))
+    return FileSurface(vertices, np.arange(len(vertices)).reshape(-1, 3))
 
 
 def _facet_count(data) -> int:
-    return int.from_bytes(data[HEADER - 4 : HEADER], "little")
+    return int.from_bytes(data[STL_HEADER - 4 : STL_HEADER], "little")
 
 
 def _read_text(data, where, remarks):
@@ -67,4 +67,4 @@ def _read_text(data, where, remarks):
     if not done:
         raise MeshError(f"{where}: no faces")
     points = np.array(vertices[:done], np.float64)
-    return Surface(points, np.arange(done).reshape(-1, 3), tuple(names), np.array(parts))
+    return FileSurface(points, np.arange(done).reshape(-1, 3), tuple(names), np.array(parts))
