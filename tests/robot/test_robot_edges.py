@@ -74,7 +74,7 @@ def test_times_are_never_late_and_early_by_the_tolerance_at_most(arms, device, m
     # What decides an edge is met in the middle of a stretch: a multiple of a small power of two.
     after = np.minimum(rows["time"][:, None] + np.arange(17) * 2.0**-14, 1.0)
     np.testing.assert_array_equal(meets(arm, AROUND, starts, ends, after).any(1), met)
-    monkeypatch.setattr(robot, "CHUNKS", {"cpu": (7,), "cuda": (7,)})
+    monkeypatch.setattr(robot, "ROOMS", {"cpu": (7,), "cuda": (7,)})
     monkeypatch.setattr(check, "EDGES_AT_ONCE", 3)
     assert arm.check_edges(starts, ends, AROUND, tolerance=2.0**-10).tobytes() == rows.tobytes()
 

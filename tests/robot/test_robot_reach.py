@@ -48,7 +48,7 @@ def find_reach(description, device, middle, half, size):
         target.assign(np.array(values, np.float64)[None])
     links.place()
     reach = wp.zeros(1, dtype=wp.float64, device=device)
-    inputs = [links.asked.chain, links.frames, links.asked.parts, links.chunk, reach]
+    inputs = [links.request.chain, links.frames, links.request.parts, links.chunk, reach]
     wp.launch(reach_kernel, 1, inputs, device=device)
     rotation, position = (
         a.numpy()[0, -1].astype(np.longdouble) for a in (links.frames.rotation, links.frames.position)
