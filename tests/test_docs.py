@@ -148,7 +148,7 @@ def run_words(words):
     devices = words[words.index("--device") + 1].split(",") if "--device" in words else ["cpu"]
     if not set(devices) <= {device.alias for device in wp.get_devices()}:
         return f"needs {', '.join(devices)}"
-    modules = {"picture": "pyvista", "--plot": "matplotlib", "parquet": "pyarrow", "warp:": "pxr"}
+    modules = {"picture": "pyvista", "--plot": "matplotlib", "warp:": "pxr"}
     if "--picture" in words and missing(["pyvista"]):
         at = words.index("--picture")
         words = words[:at] + words[at + 2 :]  # the run itself needs none

@@ -109,8 +109,7 @@ def run_frame():
 
 
 def make_shards(path):
-    file = path.suffix[1:] if path.suffix != ".json" else "npz"
-    run_shards(SweepJob(MODEL, MODEL, np.eye(7)[6:]), path.parent, file=file, pool=ThisProcess("cpu"))
+    run_shards(SweepJob(MODEL, MODEL, np.eye(7)[6:]), path.parent, pool=ThisProcess("cpu"))
 
 
 SHARD = "shard-000000000000-000000000001"
@@ -128,13 +127,10 @@ SHARD = "shard-000000000000-000000000001"
         (lambda path: write_png(np.zeros((9, 9, 3), np.uint8), path), "picture.png"),
         (make_shards, "job.json"),
         (make_shards, f"{SHARD}.npz"),
-        (make_shards, f"{SHARD}.parquet"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_every_writer_syncs_its_file_then_replaces_then_syncs_the_folder(tmp_path, calls, write, name):
-    if name.endswith("parquet"):
-        pytest.importorskip("pyarrow")
     write(tmp_path / name)
     found = (tmp_path / name).stat()
     at = [call[2:] for call in calls].index((name,))

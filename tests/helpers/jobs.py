@@ -26,8 +26,8 @@ def job_of(output="count", seed=0, count=60, shard=20):
     return SweepJob(*pair(), poses_of(count, seed), output=output, shard=shard)
 
 
-def run(job, out, file="npz", device="cpu", **options):
-    return run_shards(job, out, file=file, pool=ThisProcess(device), **options)
+def run(job, out, device="cpu", **options):
+    return run_shards(job, out, pool=ThisProcess(device), **options)
 
 
 def read(out):

@@ -1,8 +1,6 @@
 """Shards that are damaged, altered or of another job: detected when read, computed again or refused by the next run."""
 
-import importlib.util
 import json
-import sys
 import tracemalloc
 
 import numpy as np
@@ -12,20 +10,11 @@ from helpers.jobs import ColumnJob, contents, job_of, pair, poses_of, read, run,
 from warp_abtree.jobs import SweepJob, read_shards, shard_folder
 from warp_abtree.jobs.shard_folder import MANIFEST
 
-FILES = ("npz", "parquet")
 
-
-@pytest.fixture(params=FILES)
-def file(request):
-    if request.param == "parquet":
-        pytest.importorskip("pyarrow")
-    return request.param
-
-
-def refuse(job, out, *words, error=ValueError, file="npz", readers=True):
+def refuse(job, out, *words, error=ValueError, readers=True):
     """Check that a run, and a reader, refuse a folder, naming all words, and change nothing."""
     before = contents(out) if error is ValueError else None
-    for call in [lambda: run(job, out, file), lambda: list(read_shards(out))][: 1 + readers]:
+    for call in [lambda: run(job, out), lambda: list(read_shards(out))][: 1 + readers]:
         with pytest.raises(error) as caught:
             call()
         assert all(word in str(caught.value) for word in words)
@@ -56,14 +45,13 @@ DAMAGE = {  # by what it does to the second shard's file
     "column lost": rewrite(without),
     "no digest": rewrite(lambda held, _: without(held, "digest")),
 }
-WRITTEN = [*((damage, "npz") for damage in DAMAGE), ("half", "parquet"), ("another shard", "parquet")]
 
 
-@pytest.mark.parametrize(("damage", "file"), WRITTEN, indirect=["file"])
+@pytest.mark.parametrize("damage", DAMAGE)
 @pytest.mark.parametrize("output", ["count", "faces"])
-def test_a_damaged_shard_is_detected_and_computed_again(tmp_path, monkeypatch, file, output, damage):
+def test_a_damaged_shard_is_detected_and_computed_again(tmp_path, monkeypatch, output, damage):
     job, out = job_of(output), tmp_path / "out"
-    run(job, out, file)
+    run(job, out)
     whole, path = contents(out), shard_at(out, 1)
     DAMAGE[damage](path)
     assert path.read_bytes() != whole[path.name]
@@ -74,18 +62,18 @@ def test_a_damaged_shard_is_detected_and_computed_again(tmp_path, monkeypatch, f
     assert str(path) in str(caught.value) and len(str(caught.value).splitlines()) == 1
     computed, told = [], []
     monkeypatch.setattr(job, "task", lambda *part, plain=job.task: computed.append(part) or plain(*part))
-    done = run(job, out, file, progress=lambda *call: told.append(call))
+    done = run(job, out, progress=lambda *call: told.append(call))
     assert computed == [(20, 40)] and (done["shards"], done["kept"], done["damaged"]) == (3, 2, 1)
     assert told == [*(("check", k, 3) for k in (1, 2, 3)), ("shards", 2, 3), ("shards", 3, 3)]
     assert contents(out) == whole
-    assert run(job, out, file)["damaged"] == 0
+    assert run(job, out)["damaged"] == 0
 
 
 @pytest.mark.parametrize("output", ["count", pytest.param("contacts", marks=pytest.mark.slow)])
-def test_no_flipped_bit_changes_what_is_read(tmp_path, file, output):
+def test_no_flipped_bit_changes_what_is_read(tmp_path, output):
     """Flip a bit of some bytes: it is detected, or the byte has no meaning."""
     out = tmp_path / "out"
-    run(job_of(output, count=8, shard=8), out, file)
+    run(job_of(output, count=8, shard=8), out)
     path, expected = shard_at(out, 0), read(out)
     data, detected = path.read_bytes(), 0
     for place in range(0, len(data), 7 if output == "count" else 101):
@@ -118,20 +106,20 @@ def test_a_damaged_header_allocates_no_memory(tmp_path):
 
 
 @pytest.mark.parametrize("place", [0, 1])
-def test_a_shard_of_another_job_is_refused(tmp_path, file, place):
+def test_a_shard_of_another_job_is_refused(tmp_path, place):
     """Also under the name of another range."""
     job, out = job_of(), tmp_path / "out"
-    run(job, out, file)
-    run(job_of(seed=1), tmp_path / "other", file)
+    run(job, out)
+    run(job_of(seed=1), tmp_path / "other")
     path = shard_at(out, place)
     path.write_bytes(shard_at(tmp_path / "other", 1).read_bytes())
     shard_at(out, 1 - place).write_bytes(b"")
     held = path.read_bytes()
-    refuse(job, out, "a shard of another job", str(path), file=file, readers=place == 0)
+    refuse(job, out, "a shard of another job", str(path), readers=place == 0)
     path.unlink()
-    assert (run(job, out, file)["damaged"], run(job, out, file)["kept"]) == (1, 3)
+    assert (run(job, out)["damaged"], run(job, out)["kept"]) == (1, 3)
     path.write_bytes(held)
-    refuse(job, out, "a shard of another job", str(path), file=file)
+    refuse(job, out, "a shard of another job", str(path))
 
 
 @pytest.mark.parametrize("name", ["000000000000-000000000030.npz", "000000000060-000000000080.npz", "{}-{}.parquet"])
@@ -144,26 +132,16 @@ def test_a_shard_with_a_name_of_another_job_is_refused(tmp_path, name):
 
 
 @pytest.mark.parametrize("output", ["any", "count", "faces", "contacts"])
-def test_shards_of_every_output_and_file_hold_the_same(tmp_path, output):
+def test_shards_of_every_output_are_kept(tmp_path, output):
     """With a shard without rows, and a shorter last one."""
     poses = poses_of(50)
     poses[20:40, :3] += 9
-    job, found = SweepJob(*pair(), poses, output=output, shard=20), {}
-    for file in FILES if importlib.util.find_spec("pyarrow") else FILES[:1]:
-        run(job, tmp_path / file, file)
-        rows = [len(next(iter(columns.values()))) for _, _, columns in read_shards(tmp_path / file)]
-        assert rows == [20, 20, 10] if output in ("any", "count") else rows[1] == 0 < min(rows[0], rows[2])
-        assert run(job, tmp_path / file, file)["kept"] == 3
-        found[file] = read(tmp_path / file)
-        assert not set(shard_folder.STAMP_FIELDS) & set(found[file])
-    table = found.get("parquet", {})
-    if table and output in ("any", "count"):
-        np.testing.assert_array_equal(table.pop("pose"), np.arange(50))
-    for name, values in found["npz"].items() if table else ():
-        if values.ndim == 2:
-            table[name] = np.stack([table.pop(f"{name}_{axis}") for axis in "xyz"], 1)
-        np.testing.assert_array_equal(table.pop(name), values)
-    assert not table
+    job, out = SweepJob(*pair(), poses, output=output, shard=20), tmp_path / "out"
+    run(job, out)
+    rows = [len(next(iter(columns.values()))) for _, _, columns in read_shards(out)]
+    assert rows == [20, 20, 10] if output in ("any", "count") else rows[1] == 0 < min(rows[0], rows[2])
+    assert run(job, out)["kept"] == 3
+    assert not set(shard_folder.STAMP_FIELDS) & set(read(out))
 
 
 @pytest.mark.parametrize(
@@ -218,14 +196,9 @@ def test_an_altered_manifest_is_refused(tmp_path, change):
     refuse(job, out, what, str(out / MANIFEST))
 
 
-def test_missing_readers_and_rights_are_no_damage(tmp_path, monkeypatch):
+def test_missing_rights_are_no_damage(tmp_path):
     run(job_of(), tmp_path / "out")
     path = shard_at(tmp_path / "out", 1)
     path.unlink()
     path.mkdir()
     refuse(job_of(), tmp_path / "out", path.name, error=OSError)
-    pytest.importorskip("pyarrow")
-    run(job_of(), tmp_path / "table", "parquet")
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(ValueError, match=r"^Parquet needs PyArrow"):
-        list(read_shards(tmp_path / "table"))

@@ -51,12 +51,9 @@ def test_shards_that_stay_are_counted(sweep, tmp_path):
 
 
 @pytest.mark.parametrize("output", ["any", "count", "faces", "contacts"])
-@pytest.mark.parametrize("file", ["npz", "parquet"])
-def test_intersecting_poses_are_counted(sweep, tmp_path, output, file):
+def test_intersecting_poses_are_counted(sweep, tmp_path, output):
     """Those of shards that were there already, too, and of damaged ones once."""
-    if file == "parquet":
-        pytest.importorskip("pyarrow")
-    words = f"a.npz b.npz poses.npy --out out --shard 40 --output {output} --file {file}"
+    words = f"a.npz b.npz poses.npy --out out --shard 40 --output {output}"
     expected = int(ab.sweep(*pair(), poses_of(), device="cpu").sum())
     assert 0 < expected < 100
     for damage in (False, False, True):

@@ -68,7 +68,7 @@ class ThisProcess:
                 wp.set_device(before)
 
 
-def run_shards(job, out, file="npz", pool=None, progress=None) -> dict:
+def run_shards(job, out, pool=None, progress=None) -> dict:
     """Run a job: write each shard when it is computed, skip shards that a former run has finished.
 
     Existing shards are checked; damaged or altered ones are computed again. Only a few shards are in memory at a time.
@@ -77,7 +77,6 @@ def run_shards(job, out, file="npz", pool=None, progress=None) -> dict:
     Args:
         job: `SweepJob`.
         out: Folder; made if it does not exist.
-        file: "npz", or "parquet", which needs pyarrow.
         pool: Workers: `RayPool`, or `ThisProcess` by default.
         progress: Called as progress("shards", done, total) after each shard, kept ones included; before that as
             progress("check", done, total) after each existing shard that is checked.
@@ -91,7 +90,7 @@ def run_shards(job, out, file="npz", pool=None, progress=None) -> dict:
         OSError: A file cannot be read or written.
         RuntimeError: A shard cannot be computed, after several attempts.
     """
-    folder = ShardFolder(out, job, file)
+    folder = ShardFolder(out, job)
     pool = ThisProcess() if pool is None else pool
     report = progress or (lambda stage, done, total: None)
     total, left = len(folder.left), folder.left

@@ -1,7 +1,7 @@
 """The folder of a job: `job.json` with a hash of the job, and a file for each range of poses.
 
-Beside its columns a shard has the hash of its job, its range, and a digest of all three, in arrays of the .npz file or
-in the metadata of the Parquet schema. Existing shards are read and checked, one column at a time.
+Beside its columns a shard has the hash of its job, its range, and a digest of all three, in arrays of the .npz
+file. Existing shards are read and checked, one column at a time.
 """
 
 import hashlib
@@ -20,8 +20,7 @@ from warp_abtree.checks.atomic_write import atomic_write, find_partial, is_speci
 
 SHARD_FORMAT, SHARD_VERSION = "warp_abtree shards", 2
 MANIFEST = "job.json"
-FILES = ("npz", "parquet")
-SHARD_NAME = re.compile(r"shard-\d{12,}-\d{12,}\.(npz|parquet)")
+SHARD_NAME = re.compile(r"shard-\d{12,}-\d{12,}\.npz")
 WRITTEN = re.compile(rf"{re.escape(MANIFEST)}|{SHARD_NAME.pattern}")
 STAMP_FIELDS = ("job", "range", "digest")
 
@@ -39,13 +38,9 @@ class ShardFolder:
         intersecting: Poses that intersect, in the shards that were checked or written.
     """
 
-    def __init__(self, out, job, file):
-        if file not in FILES:
-            raise ValueError(f"file {file!r} is none of 'npz', 'parquet'")
-        if file == "parquet":
-            _import_parquet()
+    def __init__(self, out, job):
         self.path, self.unit = Path(out), job.unit
-        known = json.loads(json.dumps({**job.describe(), "file": file}))
+        known = json.loads(json.dumps({**job.describe(), "file": "npz"}))
         self.manifest = {"format": SHARD_FORMAT, "version": SHARD_VERSION, "hash": _hash_job(known), "job": known}
         self.left = dict.fromkeys(_ranges(known))
         self.damaged: list = []
@@ -95,8 +90,6 @@ class ShardFolder:
         """
         job = self.manifest["job"]
         intersecting = sum(_count_poses(job, name, values) for name, values in columns.items())
-        if job["file"] == "parquet":
-            columns = dict(_flat(columns if self.unit in columns else {self.unit: np.arange(start, stop), **columns}))
         fault = _row_fault(job, {len(values) for values in columns.values()}, start, stop)
         if fault:
             raise RuntimeError(f"shard {start} to {stop} was answered with {fault}")
@@ -105,14 +98,9 @@ class ShardFolder:
             _add_column(digest, name, values)
         stamp = {"job": self.manifest["hash"], "range": f"{start} {stop}"}
         stamp["digest"] = _close_digest(digest, stamp["job"], stamp["range"])
-        with atomic_write(self.path / _shard_name(start, stop, job["file"])) as file:
-            if job["file"] == "npz":
-                arrays: dict[str, Any] = {name: np.array(text) for name, text in stamp.items()}
-                np.savez(file, **arrays, **columns)
-            else:
-                pyarrow, parquet = _import_parquet()
-                table = pyarrow.table({name: pyarrow.array(values) for name, values in columns.items()})
-                parquet.write_table(table.replace_schema_metadata(stamp), file)
+        with atomic_write(self.path / _shard_name(start, stop)) as file:
+            arrays: dict[str, Any] = {name: np.array(text) for name, text in stamp.items()}
+            np.savez(file, **arrays, **columns)
         self.intersecting += intersecting
 
 
@@ -120,7 +108,7 @@ def read_shards(out) -> Iterator[tuple[int, int, dict]]:
     """Yield (start, stop, columns) of each shard of a finished job, in order; columns are arrays by name.
 
     For "any" and "count" a row is a pose, from `start` on; for "faces" and "contacts" a face pair, with its pose in the
-    column `pose`. Parquet always has the column `pose`, and vectors as three columns. Each shard is checked first.
+    column `pose`. Each shard is checked first.
 
     Raises:
         ValueError: No such folder, shards are missing, or a shard is damaged, altered or of another job; it names the
@@ -153,13 +141,10 @@ def _read_shard(path, manifest, start, stop, read=lambda name, values: values) -
         ValueError: It is of another job.
         OSError: It cannot be opened.
     """
-    open_columns = _read_npz if manifest["job"]["file"] == "npz" else _read_parquet
-    if open_columns is _read_parquet:
-        _import_parquet()
     stamp, columns, rows, digest = {}, {}, set(), hashlib.sha256()
     with open(path, "rb") as file:
         try:
-            for name, values in open_columns(file):
+            for name, values in _read_npz(file):
                 if name in STAMP_FIELDS:
                     stamp[name] = str(values)
                     continue
@@ -195,26 +180,6 @@ def _read_npz(file):
                 yield name.removesuffix(".npy"), np.lib.format.read_array(member, allow_pickle=False)
 
 
-def _read_parquet(file):
-    """Yield names and arrays, the metadata first."""
-    with _import_parquet()[1].ParquetFile(file) as table:
-        schema = table.schema_arrow
-        for name, text in (schema.metadata or {}).items():
-            if name.decode() in STAMP_FIELDS:
-                yield name.decode(), text.decode()
-        for name in schema.names:
-            yield name, table.read(columns=[name]).column(0).to_numpy()
-
-
-def _import_parquet():
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise ValueError("Parquet needs PyArrow: pip install pyarrow") from None
-    return pyarrow, pyarrow.parquet
-
-
 def _add_column(digest, name, values):
     digest.update(f"{name} {values.dtype.str} {values.shape}\n".encode())
     digest.update(np.ascontiguousarray(values))
@@ -242,15 +207,6 @@ def _count_poses(job, name, values) -> int:
     return int(np.count_nonzero(values[1:] != values[:-1])) + bool(len(values)) if name == "pose" else 0
 
 
-def _flat(columns):
-    """Yield names and columns, vectors as one column per axis."""
-    for name, values in columns.items():
-        if values.ndim == 1:
-            yield name, values
-        else:
-            yield from ((f"{name}_{axis}", np.ascontiguousarray(part)) for axis, part in zip("xyz", values.T))
-
-
 # Names and the manifest.
 
 
@@ -259,8 +215,8 @@ def _ranges(job) -> list[tuple[int, int]]:
     return [(start, min(start + shard, count)) for start in range(0, count, shard)]
 
 
-def _shard_name(start, stop, file) -> str:
-    return f"shard-{start:012d}-{stop:012d}.{file}"
+def _shard_name(start, stop) -> str:
+    return f"shard-{start:012d}-{stop:012d}.npz"
 
 
 def _find_shards(path, job) -> dict[tuple[int, int], Path]:
@@ -270,7 +226,7 @@ def _find_shards(path, job) -> dict[tuple[int, int], Path]:
         ValueError: A shard's name is not one of the job.
     """
     held = {entry.name for entry in path.iterdir() if SHARD_NAME.fullmatch(entry.name) and not is_special(entry)}
-    names = {part: _shard_name(*part, job["file"]) for part in _ranges(job)}
+    names = {part: _shard_name(*part) for part in _ranges(job)}
     for other in sorted(held.difference(names.values())):
         raise ValueError(f"{path / other}: a shard of another job")
     return {part: path / name for part, name in names.items() if name in held}

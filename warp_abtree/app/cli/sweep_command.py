@@ -16,7 +16,7 @@ from warp_abtree.jobs import RayPool, SweepJob, ThisProcess, run_shards
 SUMMARY = "ask a pair of models at millions of poses, into shards"
 EXAMPLES = (
     "bunny.npz bunny.npz poses.npy --out answers",
-    "bunny.npz warp:bear poses.npy --output contacts --file parquet --workers 2 --out contacts",
+    "bunny.npz warp:bear poses.npy --output contacts --workers 2 --out contacts",
 )
 
 
@@ -36,7 +36,6 @@ def add_arguments(sub: Parser):
         sub.add_argument(f"--lod-{name}", metavar="LOD", help=f"LOD of {name.upper()}, as query (finest)")
     sub.add_file("--lods", type=Path, metavar="LODS.npy", help="LODs of both at each pose, (p, 2)")
     sub.add_argument("--shard", type=positive_count, default=65536, metavar="N", help="poses a file (65536)")
-    sub.add_argument("--file", choices=("npz", "parquet"), default="npz", help="kind of the files (npz)")
     sub.add_argument(
         "--ray",
         metavar="ADDRESS",
@@ -61,7 +60,7 @@ def run_sweep(options, progress):
         raise ValueError("--device: Ray places workers on GPUs, or CPUs where there is none; it goes with --ray none")
     if not with_ray and options.workers:
         raise ValueError("--workers: they are Ray's")
-    named = {"file": options.file, "progress": progress}
+    named = {"progress": progress}
     if with_ray:
         # Ray tells of workers that end on stdout, which is for what this command prints.
         with contextlib.redirect_stdout(sys.stderr), RayPool(options.ray, options.workers) as pool:
