@@ -122,7 +122,7 @@ def test_a_shard_of_another_job_is_refused(tmp_path, place):
     refuse(job, out, "a shard of another job", str(path))
 
 
-@pytest.mark.parametrize("name", ["000000000000-000000000030.npz", "000000000060-000000000080.npz", "{}-{}.parquet"])
+@pytest.mark.parametrize("name", ["000000000000-000000000030.npz", "000000000060-000000000080.npz"])
 def test_a_shard_with_a_name_of_another_job_is_refused(tmp_path, name):
     job, out = job_of(), tmp_path / "out"
     run(job, out)
