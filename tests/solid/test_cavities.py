@@ -163,6 +163,19 @@ def test_bodies_that_share_a_wall_face_out(name):
     assert describe_mesh(mesh_from_arrays(vertices, one))["winding"] == "inside out"
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_random_neighbours_face_out(seed):
+    """Cells of a grid in three bodies, which touch at walls, edges and corners and lie in cavities of one another."""
+    rng = np.random.default_rng(seed)
+    label = rng.integers(0, 4, (3, 3, 3))
+    vertices, faces, part = joined(*[voxel_mesh(np.argwhere(label == k), rng if seed % 2 else None) for k in (1, 2, 3)])
+    flip = (rng.random(3) < 0.5)[part] ^ (rng.random(len(part)) < 0.2 * (seed % 3 == 2))
+    order = rng.permutation(len(faces))
+    mended = orient_mesh(mesh_from_arrays(vertices, np.where(flip[:, None], faces[:, ::-1], faces)[order]))
+    assert volume(mended.vertices, mended.faces) == 6 * np.count_nonzero(label)
+    assert describe_mesh(mended)["winding"] == "outwards"
+
+
 def test_parts_that_cross_are_bodies_of_their_own():
     """Of such a part one side is inside another and one is not, whatever it faces: it faces out."""
     for parts in (
