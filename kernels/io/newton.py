@@ -29,6 +29,7 @@ class RigidContacts:
 class ShapeSettings:
     """Settings of shapes as of `newton.Model`, shape [shape_count]."""
 
+    type: wp.array(dtype=wp.int32)  # newton.GeoType
     scale: wp.array(dtype=wp.vec3)  # along the axes of the shape's frame
     margin: wp.array(dtype=wp.float32)  # surface margin [m]
     gap: wp.array(dtype=wp.float32)  # how far beyond the margin contacts begin [m]
@@ -55,7 +56,7 @@ def find_changed_kernel(
     """
     s = wp.tid()
     same = ((kept.flags[s] ^ now.flags[s]) & collides) == 0 and kept.collision_group[s] == now.collision_group[s]
-    same = same and kept.world[s] == now.world[s] and kept.body[s] == now.body[s]
+    same = same and kept.type[s] == now.type[s] and kept.world[s] == now.world[s] and kept.body[s] == now.body[s]
     if is_own[s] != 0:
         same = same and kept.scale[s] == now.scale[s]
         same = same and kept.margin[s] == now.margin[s] and kept.gap[s] == now.gap[s]

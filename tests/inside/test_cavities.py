@@ -31,6 +31,12 @@ def joined(*parts):
     return vertices, faces, np.repeat(np.arange(len(parts)), [len(part[1]) for part in parts])
 
 
+def mirrored(part, k):
+    """Return a part of height 1 with its lower side at k, every other one upside down."""
+    vertices, faces = part
+    return (vertices * [1, 1, -1] + [0, 0, k + 1], faces[:, ::-1]) if k % 2 else (vertices + [0, 0, k], faces)
+
+
 TETRAHEDRON = CORNERS[[0, 3, 5, 6]], np.array([(0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2)])
 SHELLS = {
     "two": joined(box(3), box(1, (1, 1, 1))),
@@ -126,6 +132,48 @@ def test_sizes_and_places_do_not_matter(scale, at):
     mended = orient_mesh(mesh_from_arrays(vertices * scale + at, faces))
     same = (mended.faces == mesh_from_arrays(vertices, faces).faces).all(1)
     np.testing.assert_array_equal(same, part != 1)
+
+
+TOUCHING = {
+    "a row of boxes, walls cut otherwise": (joined(*[box(1, (k, 0, 0)) for k in range(3)]), 3),
+    "a stack, walls cut alike": (joined(*[mirrored(box(1), k) for k in range(3)]), 3),
+    "two cavities with a wall between in a box": (joined(box(5), box(1, (1, 2, 2)), box(1, (2, 2, 2))), 125 - 2),
+    "eight, with a cavity each": (
+        joined(
+            *[box(1, at) for at in CORNERS],
+            *[(TETRAHEDRON[0] / 4 + at + 0.25, TETRAHEDRON[1]) for at in CORNERS],
+        ),
+        8 - Fraction(8, 3 * 64),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TOUCHING)
+def test_bodies_that_share_a_wall_face_out(name):
+    """Their edges at the wall have four faces; a cavity's and another's sides end there alike."""
+    (vertices, faces, part), material = TOUCHING[name]
+    rng = np.random.default_rng(list(TOUCHING).index(name))
+    for case in range(6):
+        flip = (rng.random(part.max() + 1) < 0.5)[part] ^ (rng.random(len(part)) < 0.2 * (case > 2))
+        order = rng.permutation(len(faces))
+        mended = orient_mesh(mesh_from_arrays(vertices, np.where(flip[:, None], faces[:, ::-1], faces)[order]))
+        assert volume(mended.vertices, mended.faces) == 6 * material
+        assert describe_mesh(mended)["winding"] == "outwards"
+    one = np.where((part == 1)[:, None], faces[:, ::-1], faces)
+    assert describe_mesh(mesh_from_arrays(vertices, one))["winding"] == "inside out"
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_random_neighbours_face_out(seed):
+    """Cells of a grid in three bodies, which touch at walls, edges and corners and lie in cavities of one another."""
+    rng = np.random.default_rng(seed)
+    label = rng.integers(0, 4, (3, 3, 3))
+    vertices, faces, part = joined(*[voxel_mesh(np.argwhere(label == k), rng if seed % 2 else None) for k in (1, 2, 3)])
+    flip = (rng.random(3) < 0.5)[part] ^ (rng.random(len(part)) < 0.2 * (seed % 3 == 2))
+    order = rng.permutation(len(faces))
+    mended = orient_mesh(mesh_from_arrays(vertices, np.where(flip[:, None], faces[:, ::-1], faces)[order]))
+    assert volume(mended.vertices, mended.faces) == 6 * np.count_nonzero(label)
+    assert describe_mesh(mended)["winding"] == "outwards"
 
 
 def test_parts_that_cross_are_bodies_of_their_own():

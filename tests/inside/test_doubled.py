@@ -79,8 +79,8 @@ def test_what_holds_nothing_says_so(device, name):
         scene.add(ball, pose=(x + 0.01, 0.02, 0.03, 0, 0, 0, 1))
     assert scene.intersect([(0, 1 + k) for k in range(len(places))]).any.tolist() == held
     manager = ab.CollisionManager(device)
-    _, said = quietly(manager.add_object, "body", mesh)
-    assert len(said) == (count > 0)
+    _, said = quietly(manager.add_object, ("link", 3), mesh)
+    assert len(said) == (count > 0) and all("\"('link', 3)\"" in each for each in said)
     found = [
         manager.in_collision_single(BALL, trimesh.transformations.translation_matrix((x + 0.01, 0.02, 0.03)))
         for x in places

@@ -130,6 +130,7 @@ def change(model, name, shape, value):
 
 
 CHANGES = {
+    "shape_type": (3, int(newton.GeoType.BOX)),
     "shape_scale": (1, (1.0, 1.0, -1.0)),
     "shape_margin": (2, 0.01),
     "shape_gap": (0, 0.5),
@@ -152,28 +153,28 @@ def test_what_is_read_once_is_refused_where_it_changed(device, name, captured):
             pytest.skip("no graph without a memory pool")
         with wp.ScopedCapture(wp.get_device(device)) as capture:
             found.launch(state, contacts)
-    shape, value = CHANGES[name]
-    kept = np.array(getattr(model, name).numpy()[shape])
-    change(model, name, shape, value)
-    message = rf"^{name} of shape {shape} changed since NewtonContacts read it, once; make a new one$"
-    with pytest.raises(RuntimeError, match=message):
+
+    def ask():
         if captured:
             wp.capture_launch(capture.graph)
             wp.capture_launch(capture.graph)
             found.check(contacts)
         else:
             found.collide(state, contacts)
-    change(model, name, shape, kept)
-    found.collide(state, contacts)
-    if not captured:
-        # Another array in its place.
-        values = getattr(model, name)
-        setattr(model, name, wp.clone(values))
-        found.collide(state, contacts)
+
+    shape, value = CHANGES[name]
+    values = getattr(model, name)
+    kept = np.array(values.numpy()[shape])
+    message = rf"^{name} of shape {shape} changed since NewtonContacts read it, once; make a new one$"
+    # The array itself, then another in its place.
+    for other in (values, wp.clone(values)):
+        setattr(model, name, other)
+        ask()
         change(model, name, shape, value)
         with pytest.raises(RuntimeError, match=message):
-            found.collide(state, contacts)
-        setattr(model, name, values)
+            ask()
+        change(model, name, shape, kept)
+        ask()
 
 
 def test_other_meshes_and_filters_are_refused(device):
@@ -208,3 +209,11 @@ def test_what_is_read_at_every_call_may_change(device):
     assert 0 < int(contacts.rigid_contact_count.numpy()[0]) < before
     touched = contacts.rigid_contact_shape1.numpy()[: int(contacts.rigid_contact_count.numpy()[0])]
     assert 1 not in touched and 2 in touched
+
+
+@pytest.mark.parametrize("solids", [[True, False, True, False], np.array([True]), [0.5], "all"])
+def test_solids_are_indices(device, solids):
+    """A mask is no list of indices: it would make solids of shapes 0 and 1."""
+    with pytest.raises(ValueError, match=r"^solids: .* is neither a bool nor indices of shapes$"):
+        ab.NewtonContacts(stack(device), solids=solids)
+    assert not any(ab.NewtonContacts(stack(device), solids=[]).scene.object_solid)

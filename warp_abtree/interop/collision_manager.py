@@ -107,7 +107,7 @@ class CollisionManager(DeviceMemory):
         return list(self._slots), np.array(list(self._slots.values()), np.int32)
 
     def _external(self, mesh, transform):
-        return [(EXTERNAL, shape_of(mesh), self._matrix(transform, EXTERNAL))]
+        return [(EXTERNAL, shape_of(mesh, EXTERNAL), self._matrix(transform, EXTERNAL))]
 
     @staticmethod
     def _matrix(transform, name):
@@ -130,7 +130,7 @@ class CollisionManager(DeviceMemory):
             MeshError: The mesh cannot be used.
             ValueError: The transform is not rigid within 1e-6; nothing is changed.
         """
-        matrix, shape = self._matrix(transform, name), shape_of(mesh)
+        matrix, shape = self._matrix(transform, name), shape_of(mesh, name)
         if name in self._slots:
             self.remove_object(name)
         self._slots[name] = self._placed.add(shape, matrix)

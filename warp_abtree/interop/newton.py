@@ -27,7 +27,7 @@ from warp_abtree.scene.scene import Scene
 
 # Pairs of other shapes that there is room for by default.
 OTHERS_MAX = 2**16
-SETTINGS = ("scale", "margin", "gap", "flags", "collision_group", "world", "body")
+SETTINGS = ("type", "scale", "margin", "gap", "flags", "collision_group", "world", "body")
 CONTACT_FIELDS = ("shape0", "shape1", "point0", "point1", "offset0", "offset1", "normal", "margin0", "margin1")
 
 
@@ -105,7 +105,9 @@ def _find_solids(shapes, solids):
     """Return whether each mesh shape is a solid, of what `NewtonContacts` takes for it."""
     if isinstance(solids, bool):
         return solids
-    solids = np.asarray(solids, np.int64).reshape(-1)
+    solids = np.asarray(solids).reshape(-1)
+    if len(solids) and solids.dtype.kind not in "iu":  # a mask would be read as indices 0 and 1
+        raise ValueError(f"solids: {solids.tolist()} is neither a bool nor indices of shapes")
     others = np.setdiff1d(solids, shapes)
     if len(others):
         raise ValueError(f"solids: shape {others[0]} is no mesh that collides")
@@ -117,9 +119,10 @@ class NewtonContacts(DeviceMemory):
 
     Read at every call: poses of bodies, `shape_transform`, and what Newton's own pipeline reads of shapes that are no
     meshes. Read once: meshes (`shape_source`), `shape_scale`, `shape_margin` and `shape_gap` of mesh shapes, and of all
-    shapes `shape_body`, `shape_world`, `shape_collision_group`, `shape_flags` and `shape_collision_filter_pairs`. Where
-    these are others than they were, `collide` and `check` raise RuntimeError. What a mesh changes in place, such as its
-    vertices, is not noticed.
+    shapes `shape_type`, `shape_body`, `shape_world`, `shape_collision_group`, `shape_flags` and
+    `shape_collision_filter_pairs`. Where these are others than they were, `collide` and `check` raise RuntimeError.
+    What a mesh changes in place, such as its vertices, is not noticed. A captured graph reads the arrays that it was
+    captured with: change `shape_transform` in place.
 
     Args:
         model: `newton.Model`.
@@ -140,7 +143,7 @@ class NewtonContacts(DeviceMemory):
     Raises:
         ImportError: Newton is not installed.
         ValueError: Fewer than two mesh shapes; a mesh whose surface moves (`enable_surface_velocity`); or a solid that
-            is no mesh shape.
+            is no index of a mesh shape.
         MeshError: A solid whose mesh is not closed; the message names edges.
     """
 
@@ -208,23 +211,20 @@ class NewtonContacts(DeviceMemory):
         for name in SETTINGS:
             setattr(self._kept, name, wp.clone(getattr(self.model, f"shape_{name}")))
 
-    def _find_changes(self):
-        """Report the first shape whose settings are others than they were. Launches only."""
+    def _refuse_changes(self):
+        """Raise where settings are others than they were. Waits for the device."""
+        # Not within `launch`: a graph would go on with arrays that others have replaced.
         now = kernels.ShapeSettings()
         for name in SETTINGS:
             setattr(now, name, getattr(self.model, f"shape_{name}"))
         inputs = [int(self.newton.ShapeFlags.COLLIDE_SHAPES), self._is_own, self._kept, now, self._changed]
         wp.launch(kernels.find_changed_kernel, len(self._is_own), inputs, device=self.device)
-
-    def _refuse_changes(self):
-        """Raise where the last call found other settings than there were. Waits for the device."""
         what, shape = "", int(self._changed.numpy()[0])
         filters = self.model.shape_collision_filter_pairs
         if shape < len(self._is_own):
             self._changed.fill_(len(self._is_own))
-            now = [getattr(self.model, f"shape_{name}").numpy()[shape].tolist() for name in SETTINGS]
-            kept = [getattr(self._kept, name).numpy()[shape].tolist() for name in SETTINGS]
-            names = [f"shape_{name}" for name, a, b in zip(SETTINGS, now, kept) if a != b]
+            both = [[getattr(these, name).numpy()[shape].tolist() for name in SETTINGS] for these in (now, self._kept)]
+            names = [f"shape_{name}" for name, a, b in zip(SETTINGS, *both) if a != b]
             what = f"{', '.join(names) or 'settings'} of shape {shape}"
         elif self.model.shape_source != self._sources:
             what = "shape_source"
@@ -312,7 +312,6 @@ class NewtonContacts(DeviceMemory):
         body_q = self._no_body if body_q is None else body_q
         inputs = [self._ids, body_q, self.model.shape_body, self.model.shape_transform, self.scene.batch().objects.pool]
         wp.launch(kernels.pose_object_kernel, len(self.shapes), inputs, device=self.device)
-        self._find_changes()
 
     def _write(self, state, contacts):
         if self.others is None:

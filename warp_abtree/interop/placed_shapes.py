@@ -35,8 +35,8 @@ class Shape:
 _SHAPES: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
 
 
-def shape_of(mesh) -> Shape:
-    """Return the shape of a mesh, by content, or of a model."""
+def shape_of(mesh, name) -> Shape:
+    """Return the shape of a mesh, by content, or of a model; warnings call a mesh by the first name that it had."""
     import trimesh
 
     key: tuple = ("model", id(mesh))
@@ -46,7 +46,7 @@ def shape_of(mesh) -> Shape:
     if shape is None:
         model = mesh
         if not isinstance(mesh, Model):
-            source = load_mesh(mesh)
+            source = load_mesh(mesh, str(name) if isinstance(mesh, trimesh.Trimesh) else None)
             # Only the finest LOD is used, so there is nothing to collapse.
             model = Model.load(source, base_faces=len(source.faces))
         shape = Shape(model)

@@ -108,7 +108,7 @@ def describe_mesh(mesh):
     Dropped faces are not counted. An area is zero if its float64 cross product is within the error bound of its
     computation. Faces with the same three corners in any order are duplicates; each one after the first counts. Faces
     that share a vertex are of one component. A mesh is closed if every edge belongs to an even number of faces. Its
-    winding is mixed where two faces run along an edge the same way, inside out where parts are, see
+    winding is mixed where faces disagree about the outside at an edge, inside out where parts are, see
     `warp_abtree.model.winding`, else consistent, and outwards if the mesh is closed too. What it holds as a solid is
     told in words.
     """

@@ -5,31 +5,27 @@ point off it, crosses it an even or an odd number of times whichever way it goes
 every LOD: a face is active while its corners are distinct, a merge of two vertices maps faces to faces or to nothing
 and the edges of faces to the edges of their images or to nothing, and numbers of faces at an edge add up.
 
-Faces that meet at edges of two faces form a part. It is mixed where two faces run along an edge the same way. It is
+Faces that meet at edges of two faces form a part. It is mixed where two faces run along an edge the same way; so are
+several at an edge of more, of a closed mesh, where more of them run along it one way than the other. A part is
 inside out where it is closed by itself and not mixed, and its faces point to where parity says inside: a body faces
 out, the wall of a cavity in it faces into the cavity, a body in that cavity faces out again. Of a part some corners and
-middles of faces are looked at, those that are not on another surface; it is within that where all of them are.
+middles of faces are looked at, those that are not on another surface; it is within that where all of them are. A part
+that others close, as where bodies touch at a wall, is judged by parity on both sides of its faces.
 
 Of faces with the same three corners an even number cancels: parity counts none of them.
 """
 
 import warnings
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
 from warp_abtree.model.files.found import MeshError
+from warp_abtree.model.sides import SAMPLED_FACES, holds_points, loose_inside_out, nearness, volume_sign
 
 SHOWN_EDGES = 4
-# Of the sum of all products of three coordinates: 80 roundings of 2^-53 in each, and those of the sum.
-VOLUME_ROUNDING = 2.0**-45
-# Faces of a part whose first corner and middle are looked at, and entries of a table of points and faces.
-SAMPLED_FACES = 16
-TABLE = 2**22
-# Points as near to a surface count as on it, as a part of its size, and of coordinates.
-NEAR_FRACTION, NEAR_ROUNDING = 1e-9, 2.0**-48
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +38,7 @@ class Winding:
         face_ids: Their indices in the mesh, int (n,).
         odd_edges: Edges of an odd number of faces: vertices in ascending order, (k, 2); none of a closed mesh.
         odd_faces: The lowest face at each, (k,).
-        mixed_edges: Edges of two faces that run along them the same way.
+        mixed_edges: Edges of two faces, of a closed mesh of more too, along which more run one way than the other.
         part: The lowest row of each face's part, (n,).
         joints: Rows of the two faces at each edge that has two, (j,) each, and whether they run along it opposite ways.
     """
@@ -64,7 +60,7 @@ class Winding:
     @cached_property
     def inside_out(self) -> np.ndarray:
         """Rows of the faces of all parts that are inside out."""
-        return _inside_out(self.vertices, self.faces, self.part)
+        return _inside_out(self.vertices, self.faces, self.part, self.doubled)
 
     @cached_property
     def doubled(self) -> np.ndarray:
@@ -112,7 +108,7 @@ class Winding:
         kept = np.bincount(self.part, sign, len(self.faces))
         sign = np.where(kept[self.part] < 0, -sign, sign)
         faces = np.where(sign[:, None] < 0, self.faces[:, ::-1], self.faces)
-        turned = _inside_out(self.vertices, faces, self.part)
+        turned = _inside_out(self.vertices, faces, self.part, self.doubled)
         faces[turned] = faces[turned][:, ::-1]
         return faces
 
@@ -123,6 +119,8 @@ def find_winding(vertices, faces, dropped_faces=()) -> Winding:
     faces = np.asarray(faces, np.int64)[face_ids]
     key, forward, row, start, count = _sorted_edges(faces, len(vertices))
     odd, two = start[count % 2 == 1], start[count == 2]
+    # Bodies that each agree about the outside run along an edge as often one way as the other.
+    mixed = (np.add.reduceat(np.where(forward, 1, -1), start) != 0) & ((count == 2) | (len(odd) == 0))
     first, second, opposite = row[two], row[two + 1], forward[two] != forward[two + 1]
     return Winding(
         vertices=vertices,
@@ -130,7 +128,7 @@ def find_winding(vertices, faces, dropped_faces=()) -> Winding:
         face_ids=face_ids,
         odd_edges=np.stack([key[odd] // len(vertices), key[odd] % len(vertices)], 1),
         odd_faces=face_ids[row[odd]],
-        mixed_edges=int(np.count_nonzero(~opposite)),
+        mixed_edges=int(np.count_nonzero(mixed)),
         part=component_labels(np.stack([first, second], 1), len(faces)),
         joints=(first, second, opposite),
     )
@@ -233,7 +231,7 @@ def _doubled(faces, vertex_count):
     return np.flatnonzero(even[number])
 
 
-def _inside_out(vertices, faces, part):
+def _inside_out(vertices, faces, part, doubled):
     """Return the rows of the faces of all parts that are inside out."""
     names, part = np.unique(part, return_inverse=True)
     key, forward, row = _edges(faces, len(vertices))
@@ -256,76 +254,22 @@ def _inside_out(vertices, faces, part):
     upper = np.maximum.reduceat(corners.max(1)[order], start)
     turned = []
     for k in np.flatnonzero(is_whole):
-        near = _nearness(lower[k], upper[k])
+        near = nearness(lower[k], upper[k])
         around = counts & (lower <= lower[k] + near).all(1) & (upper >= upper[k] - near).all(1)
         around[k] = False
         depth = 0
         if around.any():
             some = corners[rows[k][np.unique(np.linspace(0, len(rows[k]) - 1, SAMPLED_FACES).astype(int))]]
             points = np.stack([some[:, 0], some.mean(1)], 1).reshape(-1, 3)
-            depth = sum(_holds(corners[rows[other]], points) for other in np.flatnonzero(around))
-        if _volume_sign(corners[rows[k]]) == (1 if depth % 2 else -1):
+            depth = sum(holds_points(corners[rows[other]], points) for other in np.flatnonzero(around))
+        if volume_sign(corners[rows[k]]) == (1 if depth % 2 else -1):
             turned.append(rows[k])
+    loose = ~whole & (np.bincount(part, ~closed) == 0)
+    loose[part[doubled]] = False
+    if loose.any():
+        counted = np.concatenate([rows[k] for k in np.flatnonzero(counts)])
+        name, border = own[balance != 0] // len(edges), own[balance != 0] % len(edges)
+        start, ways = np.searchsorted(name, np.arange(len(names) + 1)), balance[balance != 0]
+        borders = [(border[a:b].tobytes(), ways[a:b].tobytes()) for a, b in pairwise(start)]
+        turned += loose_inside_out(vertices, faces, part, np.flatnonzero(loose), counted, borders)
     return np.sort(np.concatenate(turned)) if turned else np.empty(0, np.int64)
-
-
-def _volume_sign(corners) -> int:
-    """Return the sign of the volume within a closed, consistently wound surface, exactly."""
-    origin = corners[0, 0]
-    scale = np.abs(corners - origin).max()
-    a, b, c = ((corners[:, k] - origin) / scale for k in range(3))
-    terms = np.einsum("ij,ij->i", a, np.cross(b, c))
-    a, b, c = np.abs(a), np.abs(b), np.abs(c)
-    sizes = np.roll(b, -1, 1) * np.roll(c, -2, 1) + np.roll(b, -2, 1) * np.roll(c, -1, 1)
-    volume = terms.sum()
-    if abs(volume) <= VOLUME_ROUNDING * np.einsum("ij,ij->", a, sizes):
-        volume = sum(_exact_volume(*face) for face in corners)
-    return int(volume > 0) - int(volume < 0)
-
-
-def _exact_volume(a, b, c) -> Fraction:
-    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = ([Fraction(x) for x in p] for p in (a.tolist(), b.tolist(), c.tolist()))
-    return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
-
-
-def _nearness(lower, upper):
-    """Return how near to a surface in a box counts as on it."""
-    return max(NEAR_FRACTION * (upper - lower).max(), NEAR_ROUNDING * max(np.abs(lower).max(), np.abs(upper).max()))
-
-
-def _holds(corners, points) -> bool:
-    """Return whether a closed surface holds those of some points that are not on it, and there are some."""
-    box = corners.min(1).T, corners.max(1).T
-    near = _nearness(box[0].min(1), box[1].max(1))
-    step = max(1, TABLE // len(corners))
-    held = False
-    for at in range(0, len(points), step):
-        sides = _sides(corners, box, points[at : at + step], near)
-        if (sides < 0).any():
-            return False
-        held |= bool((sides > 0).any())
-    return held
-
-
-def _sides(corners, box, points, near):
-    """Return 1 for points in a closed surface, -1 for those outside, 0 for those on it: crossings of rays along z."""
-    lower, upper = box
-    least, most = (points - near).T[..., None], (points + near).T[..., None]
-    column = (most[0] >= lower[0]) & (most[1] >= lower[1]) & (least[0] <= upper[0]) & (least[1] <= upper[1])
-    point, face = np.nonzero(column & (least[2] <= upper[2]))
-    x = corners[face] - points[point, None]
-    normal = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
-    height = np.einsum("ij,ij->i", normal, x[:, 0])
-    on = (most[2, point, 0] >= lower[2, face]) & (np.abs(height) <= near * np.linalg.norm(normal, axis=1))
-    high = x[:, :, 1] > 0
-    crosses = np.zeros(len(x), bool)
-    for k in range(3):
-        a, b = x[:, k], x[:, (k + 1) % 3]
-        # The same numbers for both faces of an edge.
-        swap = (high[:, k] > high[:, (k + 1) % 3])[:, None]
-        a, b = np.where(swap, b, a), np.where(swap, a, b)
-        crosses ^= (high[:, k] != high[:, (k + 1) % 3]) & (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0)
-    crosses &= (x[:, :, 2].min(1) > 0) | (height * normal[:, 2] > 0)
-    sides = np.where(np.bincount(point[crosses], minlength=len(points)) % 2, 1, -1)
-    sides[point[on]] = 0
-    return sides
