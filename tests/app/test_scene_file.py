@@ -298,7 +298,7 @@ def test_what_is_too_much_is_refused_at_once(tmp_path, monkeypatch, text, messag
 
 
 def test_a_file_of_any_size_is_not_read_whole(tmp_path, monkeypatch):
-    monkeypatch.setattr(decode, "SIZE_LIMIT", len(ONE))
+    monkeypatch.setattr(decode, "FILE_SIZE_LIMIT", len(ONE))
     load(tmp_path, ONE)
     with pytest.raises(SceneError, match=f"the file: has more than {len(ONE)} bytes"):
         load(tmp_path, ONE + "\n")

@@ -50,8 +50,8 @@ def test_labels_of_a_logarithmic_axis_do_not_overlap(tmp_path):
 
 
 @pytest.mark.parametrize("file", sorted(DATA.glob("*.json")), ids=lambda path: path.name)
-def test_pages_repeat_their_data(file, tmp_path):
-    """python -m bench.tables docs/data/*.json writes the pages; all tables and figures have rows."""
+def test_pages_repeat_their_data(file):
+    """python -m bench.tables docs/data/*.json writes the pages; all tables have rows."""
     data = json.loads(file.read_text(encoding="utf-8"))
     pages = tables.find_pages(file)
     assert pages and not any("Not measured" in text for text in pages.values())
@@ -59,7 +59,13 @@ def test_pages_repeat_their_data(file, tmp_path):
     assert not any(part["run"].get("quick") for part in data["parts"].values())
     if data["study"] != "performance":
         assert set(study.find_study(data["study"]).PARTS) == set(data["parts"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("file", sorted(DATA.glob("*.json")), ids=lambda path: path.name)
+def test_figures_have_rows(file, tmp_path):
     pytest.importorskip("matplotlib")
+    data = json.loads(file.read_text(encoding="utf-8"))
     figures = tables.read_layout(f"studies/{data['study']}.toml").get("figure", [])
     said = tables.draw(figures, lambda figure: tables.select_rows(figure, data), tmp_path)
     assert all(figure["file"] in said for figure in figures)

@@ -90,7 +90,7 @@ def anchored_sheets(rng, roughness, far, aside):
     return models, poses
 
 
-@pytest.mark.parametrize("roughness", [1e-6, 1e-8, 1e-10])
+@pytest.mark.parametrize("roughness", [pytest.param(1e-6, marks=pytest.mark.slow), 1e-8, 1e-10])
 @pytest.mark.parametrize("far", [0.0, 100.0])
 @pytest.mark.parametrize("bend", [0.0, 0.3])
 def test_nearly_equally_near_faces(device, roughness, far, bend):
@@ -98,7 +98,7 @@ def test_nearly_equally_near_faces(device, roughness, far, bend):
     check_sheets(device, [sheets(rng, roughness, far, bend) for _ in range(3)], 1 + far)
 
 
-@pytest.mark.parametrize("roughness", [1e-6, 1e-8])
+@pytest.mark.parametrize("roughness", [pytest.param(1e-6, marks=pytest.mark.slow), 1e-8])
 @pytest.mark.parametrize("far", [3.0, 100.0])
 @pytest.mark.parametrize("aside", [0.1, 0.0])
 def test_nearly_equally_near_faces_of_large_objects(device, roughness, far, aside):

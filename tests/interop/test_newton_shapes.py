@@ -71,7 +71,7 @@ def scene_of(device, scale, mirrored_by_hand, on_body, solids):
 @pytest.mark.parametrize("solids", [False, True])
 @pytest.mark.parametrize("on_body", [False, True])
 def test_mirrored_shapes_are_those_mirrored_by_hand(device, on_body, solids):
-    for scale in itertools.product((1.0, -1.0, -2.0), (1.0, -0.5), (1.0, -1.0)):
+    for scale in itertools.product((1.0, -2.0), (1.0, -0.5), (1.0, -1.0)):
         found, expected = (
             points_of(scene_of(device, np.array(scale), by_hand, on_body, solids)[0], solids=solids)
             for by_hand in (False, True)

@@ -37,12 +37,12 @@ def test_no_vertex_lies_beyond_the_error():
 @pytest.mark.parametrize("slots", [0, 1, 8, 40])
 def test_covers_on_fewer_faces_than_they_want_are_measured_again(slots, monkeypatch):
     """Polygons that find no slot stand on a face that is used already, perhaps a far one, and the bound must say so."""
-    mesh, looser = bumpy_sheet(10, 0.3, 1), 0
+    mesh, looser = bumpy_sheet(8, 0.3, 1), 0
     plenty = build_progressive(mesh, base_faces=1, certify=True)
     monkeypatch.setattr(lod_bounds, "SLOTS_PER_FACE", 0)
     monkeypatch.setattr(lod_bounds, "SLOTS_EXTRA", slots)
     progressive = build_progressive(mesh, base_faces=1)
-    points = lattice_points(plenty.vertex_pos[mesh.faces], 6)
+    points = lattice_points(plenty.vertex_pos[mesh.faces], 4)
     for lod in range(0, progressive.lod_max, 5):
         vertices, faces, _ = progressive.mesh_at(lod)
         assert brute_distances(points, vertices[faces]).max() <= progressive.lod_error[lod] + 1e-13
