@@ -21,7 +21,12 @@ COMB = [*COMB[:-1], (-2, 0)]
 TURNS = [(round(64 * r * math.cos(k / 3)), round(64 * r * math.sin(k / 3))) for r in (1, 2) for k in range(20)]
 SPIRAL = [(x * (k + 6), y * (k + 6)) for k, (x, y) in enumerate(TURNS[20:])]
 SPIRAL += [(x * (k + 6), y * (k + 6)) for k, (x, y) in reversed(list(enumerate(TURNS[:20])))]
+DOUBLED = [point for point in LETTER[5:] + LETTER[:5] for _ in range(2)]
+LINKED = [(0, 0), (9, 0), (9, 9), (0, 9), (0, 0), (1, 1), (1, 4), (4, 4), (5, 5)]  # two holes
+LINKED += [(5, 8), (8, 8), (8, 5), (5, 5), (4, 4), (4, 1), (1, 1)]
+NOTCHED = [(0, 0), (2**17, 0), (2**17, 2**17), (0, 2**17), (0, 2), (1, 1)]
 POLYGONS = {"letter": LETTER, "comb": COMB, "spiral": SPIRAL, "letter turned": LETTER[3:] + LETTER[:3]}
+POLYGONS |= {"doubled": DOUBLED, "linked holes": LINKED, "notched": NOTCHED}
 DAE = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1"><asset>
 <created>2020-01-01T00:00:00</created><modified>2020-01-01T00:00:00</modified></asset><library_geometries>
 <geometry id="g"><mesh><source id="p"><float_array id="a" count="{numbers}">{points}</float_array><technique_common>
@@ -144,9 +149,11 @@ def test_polygons_are_covered_once(tmp_path, name, shape):
     stem = {"archive.zip": "inside", "packed.ply.gz": "packed"}.get(name, name.split(".")[0])
     assert names == ["plate" if name.endswith(".dae") else stem]
     vertices, found, _ = scene.models[0].mesh_at(scene.models[0].lod_max)
-    for triangles in (mesh.vertices[mesh.faces], vertices[found]):
-        assert len(triangles) == 1 + count - 2 + 2
-        assert (triangles[[0, -2, -1]] >= [50, 0, 0]).all(), "faces keep the order of the file"
+    dropped = len(mesh.dropped_faces)
+    for triangles, fewer in ((mesh.vertices[mesh.faces], 0), (vertices[found], dropped)):
+        assert len(triangles) == 1 + count - 2 + 2 - fewer
+        quad = triangles[[0, -2, -1]]
+        assert (quad >= [50, 0, 0]).all() and (quad <= [51, 1, 0]).all(), "faces keep the order of the file"
         check_cover(triangles[1:-2], POLYGONS[shape])
 
 
@@ -193,6 +200,9 @@ FACES, HEAD = [list(range(8))], ply(LETTER, [])
 BOX = trimesh.creation.box()
 BINARY, TEXT = BOX.export(file_type="stl"), BOX.export(file_type="stl_ascii").encode()
 
+MARKED = {kind: BOX.export(file_type=kind) for kind in ("obj", "off", "stl_ascii")}
+MARKED = {kind: text.encode() for kind, text in MARKED.items()} | {"ply": BOX.export(file_type="ply", encoding="ascii")}
+
 
 @pytest.mark.parametrize(
     "name, data, message",
@@ -215,6 +225,7 @@ BINARY, TEXT = BOX.export(file_type="stl"), BOX.export(file_type="stl_ascii").en
         ("a.off", b"solid", "does not begin with OFF"),
         ("a.stl", BINARY[:90], "no faces: its header declares 12 facets"),
         ("a.stl", BINARY[:80] + bytes(4) + BINARY[84:], "declares 0 facets, and 12 would fit"),
+        ("a.stl", BINARY[:80] + bytes(4), "declares 0 facets, and 0 would fit"),
         ("a.stl", TEXT.replace(b"endloop", b"vertex 0 0 0\nendloop"), "a facet of 4 vertices"),
         ("a.dae", dae(LETTER, f"<polygons>{INPUT}<ph><p>0 1 2</p><h>3 4 5</h></ph></polygons>"), "'g' has .* holes"),
         ("a.dae", dae(LETTER, polylist(FACES).replace(">8<", ">7<")), "'g': its polygons have 7 corners"),
@@ -247,10 +258,13 @@ def test_damaged_files(tmp_path, name, data, message):
         ("a.stl", b"solid" + bytes(75) + BINARY[80:-60], 10, "cut short: 10 facets are read of the 12"),
         ("a.stl", BINARY + b"xyzzy", 12, "left out 5 bytes behind the 12 facets"),
         ("a.stl", TEXT[: TEXT.rindex(b"vertex") + 9], 11, "cut short: 11 facets are whole"),
+        ("a.stl", TEXT + bytes(3), 12, None),
+        *((f"a.{kind}", b"\xef\xbb\xbf" + data, len(BOX.faces), None) for kind, data in MARKED.items()),
         ("a.ply", ply(LETTER, FACES, "<") + b"more", 6, "left out what follows"),
         ("a.ply", ply(LETTER, FACES).replace(b"element face", b"element edge 0\nelement face"), 6, None),
         ("a.off", off(LETTER, FACES) + b"3 0 1 2\n", 6, "left out 1 lines"),
         ("a.obj", obj(LETTER, FACES) + b"l 1 2\np 3\n", 6, "left out lines, points"),
+        ("a.obj", obj(LETTER, FACES) + b"fo 1 2 3\nbsp 1 2\n", 6, "left out faces as 'fo', free-form surfaces"),
         ("a.zip", zipped(obj(LETTER, FACES), "a.obj", "b.obj.gz"), 6, "left out b.obj.gz"),
     ],
 )

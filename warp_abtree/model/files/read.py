@@ -1,5 +1,6 @@
 """Mesh files of all formats: our own readers where polygons, parts or what is left out matter, trimesh for the rest."""
 
+import codecs
 import io
 import re
 import warnings
@@ -57,19 +58,16 @@ def read_file(path: Path, remarks: Remarks):
             data = gunzip(data, str(path))
     except (OSError, EOFError, zlib.error) as error:
         raise MeshError(f"{path}: cannot be read: {first_line(error)}") from None
-    if kind in SURFACES:
-        return SURFACES[kind](data, str(path), remarks)
-    from trimesh.resolvers import FilePathResolver
-
-    return _read_data(data, kind, str(path), FilePathResolver(str(path)), remarks)
+    return _read_data(data, kind, str(path), None, remarks)
 
 
 def _read_data(data, kind, where, resolver, remarks):
-    """Return what the bytes of a file hold, as `read_file` does."""
-    import trimesh
-
+    """Return what the bytes of a file hold, as `read_file` does; without a resolver, `where` is its path."""
     if kind in SURFACES:
-        return SURFACES[kind](data, where, remarks)
+        return SURFACES[kind](data.removeprefix(codecs.BOM_UTF8), where, remarks)
+    import trimesh  # takes as long as the rest of the library
+
+    resolver = trimesh.resolvers.FilePathResolver(where) if resolver is None else resolver
     if kind in ("glb", "gltf"):
         return read_gltf(data, where, resolver, remarks)
     if kind == "dae":
