@@ -4,6 +4,7 @@ import gzip
 import io
 import math
 import struct
+import tracemalloc
 import zipfile
 from fractions import Fraction
 
@@ -295,6 +296,18 @@ def test_a_solid_of_stl_is_an_object(tmp_path):
     assert ab.Model.load(tmp_path / "a.stl").face_count == 24
 
 
+def test_members_of_archives(tmp_path):
+    """Files are looked for beside the member that names them; those that macOS hides are no meshes."""
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("__MACOSX/._a.stl", bytes([0, 5, 22, 7]) + bytes(100))
+        for folder, size in (("", 1), ("sub/", 2), ("sub/sub/", 3)):
+            for name, data in trimesh.Scene(trimesh.creation.box(extents=[size] * 3)).export(file_type="gltf").items():
+                archive.writestr(folder + name, data)
+    mesh = load_mesh(tmp_path / "a.zip")
+    sizes = np.ptp(mesh.vertices[mesh.faces].reshape(3, 36, 3), axis=1)
+    assert sizes.tolist() == [[1.0] * 3, [2.0] * 3, [3.0] * 3]
+
+
 # The limit.
 
 
@@ -313,6 +326,19 @@ def test_files_that_unpack_to_too_much_are_refused(tmp_path, name, monkeypatch):
     monkeypatch.setattr(unpack, "UNPACKED_RATIO", 10**6)
     if name in ("a.obj.gz", "a.zip"):
         assert len(load_mesh(tmp_path / name).faces) == 6
+
+
+@pytest.mark.parametrize("name", ["a.zip", "a.3mf"])
+def test_archives_that_lie_about_sizes(tmp_path, name):
+    data = bytearray(zipped(b"#" * 2**26, "a.model" if name == "a.3mf" else "a.obj"))
+    entry = data.index(b"PK\1\2")
+    data[entry + 24 : entry + 28] = struct.pack("<I", 100)
+    (tmp_path / name).write_bytes(data)
+    tracemalloc.start()
+    with pytest.raises(ab.MeshError, match="Bad CRC-32"):
+        load_mesh(tmp_path / name)
+    assert tracemalloc.get_traced_memory()[1] < 2**24
+    tracemalloc.stop()
 
 
 def test_declared_sizes_are_checked_before_arrays_are_made(tmp_path):
