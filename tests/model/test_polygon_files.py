@@ -215,6 +215,7 @@ MARKED = {kind: text.encode() for kind, text in MARKED.items()} | {"ply": BOX.ex
         ("a.ply", ply(LETTER, FACES * 2)[:-30], "cut short|does not fit the header"),
         ("a.ply", HEAD.replace(b"vertex 8", b"vertex 99999999999"), "cut short: .* 8 are whole"),
         ("a.ply", ply(LETTER, FACES, "<").replace(b"face 1\n", b"face 4000000000\n"), "cut short"),
+        ("a.ply", ply(LETTER, FACES).replace(b" 2 0.5 0.5\n", b"\n"), "does not fit the header"),
         ("a.ply", HEAD, r"no faces \(it holds vertex\)"),
         ("a.ply", HEAD.replace(b"float x", b"float u"), "no vertices with x, y and z"),
         ("a.ply", HEAD.replace(b"float x", b"quaternion x"), "header line 'property quaternion x'"),

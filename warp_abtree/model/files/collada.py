@@ -34,7 +34,7 @@ def read_collada(data: bytes, where: str, remarks: Remarks):
     for geometry in file.geometries:
         if geometry.xmlnode is not None and any(str(node.tag).endswith("}ph") for node in geometry.xmlnode.iter()):
             raise MeshError(f"{where}: geometry {geometry.id!r} has polygons with holes (<ph>), which are not read")
-    made, known = trimesh.Scene(), {}
+    made, known, counts = trimesh.Scene(), {}, {}
     open_nodes = [(node, np.eye(4), None) for node in reversed(file.scene.nodes if file.scene else [])]
     while open_nodes:
         node, above, name = open_nodes.pop()
@@ -52,7 +52,7 @@ def read_collada(data: bytes, where: str, remarks: Remarks):
                 if known[geometry.id] is not None:
                     made.geometry[geometry.id] = known[geometry.id]
             if known[geometry.id] is not None:
-                frame = trimesh.util.unique_name(name or geometry.id, made.graph.nodes)
+                frame = trimesh.util.unique_name(name or geometry.id, made.graph.nodes, counts)
                 made.graph.update(frame, geometry=geometry.id, matrix=above)
     return made
 

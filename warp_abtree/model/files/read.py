@@ -111,7 +111,7 @@ def _read_archive(members, where, remarks):
     """Return the mesh files of a zip archive in one scene, but for hidden ones, such as macOS adds to each file."""
     import trimesh
 
-    merged = trimesh.Scene()
+    merged, counts = trimesh.Scene(), {}
     for name, data in members.items():
         stem, kind, zipped = split_file_name(Path(name))
         if Path(name).name.startswith("."):
@@ -126,7 +126,7 @@ def _read_archive(members, where, remarks):
             scene = found.as_scene(stem) if isinstance(found, Surface) else found
             for node in scene.graph.nodes_geometry:
                 pose, part = scene.graph[node]
-                title = trimesh.util.unique_name(node, merged.graph.nodes)
+                title = trimesh.util.unique_name(node, merged.graph.nodes, counts)
                 merged.add_geometry(scene.geometry[part], title, f"{name}: {part}", transform=pose)
     if not merged.geometry:
         raise MeshError(f"{where}: holds no mesh file")
