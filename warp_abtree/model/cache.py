@@ -7,7 +7,6 @@ The folder is $WARP_ABTREE_CACHE if that is set, and none if it is "off"; else $
 import contextlib
 import hashlib
 import os
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from warp_abtree.model.files.read import split_file_name
 VARIABLE = "WARP_ABTREE_CACHE"
 SIZE_LIMIT = 2 << 30  # bytes in the folder; the models that were used least recently go
 KEY_DIGITS = 40
-BUILDER = 4  # grows with each change of what is built of the same mesh
+BUILDER = 5  # grows with each change of what is built of the same mesh
 LEAST_FACES = 1_000  # smaller models are built as fast as opened
 SELF_CONTAINED = {"obj", "ply", "stl", "off", "glb"}  # other formats may refer to further files
 
@@ -43,13 +42,16 @@ def file_key(source, *options) -> str | None:
     if not isinstance(source, str | os.PathLike):
         return None
     path = Path(source)
-    kind = split_file_name(path)[1:]
-    if kind[0] not in SELF_CONTAINED:
+    _, kind, zipped = split_file_name(path)
+    if kind not in SELF_CONTAINED:
         return None
     try:
-        return _key([path.read_bytes()], kind, None if kind[0] == "obj" else version("trimesh"), *options)
+        data = path.read_bytes()
     except OSError:
         return None
+    if kind == "glb" and (zipped or b'"uri"' in data):
+        return None
+    return _key([data], (kind, zipped), *options)
 
 
 def mesh_key(mesh, *options) -> str:
