@@ -198,7 +198,7 @@ def test_objects_of_dae(tmp_path):
 
 LATTICE = b'<?xml version="1.0"?><model xmlns:b="http://x/beamlattice/2017/02" requiredextensions="b"></model>'
 FACES, HEAD = [list(range(8))], ply(LETTER, [])
-BOX = trimesh.creation.box()
+BOX, PLATE = trimesh.creation.box(), dae(LETTER, polylist(FACES))
 BINARY, TEXT = BOX.export(file_type="stl"), BOX.export(file_type="stl_ascii").encode()
 
 MARKED = {kind: BOX.export(file_type=kind) for kind in ("obj", "off", "stl_ascii")}
@@ -231,6 +231,8 @@ MARKED = {kind: text.encode() for kind, text in MARKED.items()} | {"ply": BOX.ex
         ("a.stl", TEXT.replace(b"endloop", b"vertex 0 0 0\nendloop"), "a facet of 4 vertices"),
         ("a.dae", dae(LETTER, f"<polygons>{INPUT}<ph><p>0 1 2</p><h>3 4 5</h></ph></polygons>"), "'g' has .* holes"),
         ("a.dae", dae(LETTER, polylist(FACES).replace(">8<", ">7<")), "'g': its polygons have 7 corners"),
+        ("a.dae", PLATE.replace(b'stride="3"', b'stride="3" offset="3"'), "'g' has positions that are not X, Y and Z"),
+        ("a.dae", PLATE.replace(b'"X"', b'"W"').replace(b'"Z"', b'"X"').replace(b'"W"', b'"Z"'), "'g' has positions"),
         ("a.zip", zipped(off(LETTER, [[0, 1]])), "inside.off: line"),
         ("a.zip", zipped(b"", "b.txt"), "holds no mesh file"),
         ("a.3mf", zipped(LATTICE, "3D/3dmodel.model"), "requires the 3MF extension http://x/beamlattice/2017/02"),
