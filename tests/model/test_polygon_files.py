@@ -237,6 +237,11 @@ MARKED = {kind: text.encode() for kind, text in MARKED.items()} | {"ply": BOX.ex
         ("a.zip", zipped(b"", "b.txt"), "holds no mesh file"),
         ("a.3mf", zipped(LATTICE, "3D/3dmodel.model"), "requires the 3MF extension http://x/beamlattice/2017/02"),
         ("a.obj", b"o a\n" + obj(LETTER, [[0, 1, 8]]), "face 0 refers to vertex 8"),
+        (
+            "a.obj",
+            obj(LETTER, []) + b"surf 0 1 0 1 1 2 3 4\nl 1 2\n",
+            r"no faces \(left out free-form surfaces, lines\)",
+        ),
         ("a.step", b"ISO-10303-21;", "pip install cascadio"),
         ("a.usda", b"#usda 1.0", "read by scene_from_file"),
     ],

@@ -104,7 +104,7 @@ def read_obj(data: bytes, where: str, remarks: Remarks) -> Surface:
         corners.extend(polygon)
         counts.append(len(polygon))
     if not counts:
-        raise MeshError(f"{where}: no faces")
+        raise MeshError(f"{where}: no faces" + (f" ({remarks})" if str(remarks) else ""))
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
     try:
         indices = np.array(corners, dtype=np.int64) - 1
