@@ -176,6 +176,8 @@ def test_what_is_not_read_as_it_stands_is_named(tmp_path, change, message):
         (["bufferViews", 1], {"byteLength": 10**6}, "buffer view 1 ends outside its buffer"),
         (["buffers", 0], {"uri": "gone.bin"}, r"buffer 'gone\.bin' cannot be read"),
         (["bufferViews", 0], {"buffer": 1}, "is damaged: IndexError"),
+        (["accessors", 1], {"componentType": 5126, "count": 9}, "mesh 'part': its indices are no integers"),
+        (["nodes", 0], {"matrix": [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, "'crate': .* is not affine"),
         (["nodes", 0], {"children": [0]}, "node 0 hangs on two nodes or on itself"),
         (["meshes", 0, "primitives", 0], {"mode": 7}, "mesh 'part': a primitive of mode 7"),
         (["meshes", 0, "primitives", 0], {"mode": 0}, "left out points of mesh 'part'"),

@@ -1,7 +1,10 @@
 """The cache of models: a mesh that comes again is opened, and nothing wrong with the folder is an error."""
 
+import gzip
+import json
 import os
 import shutil
+import struct
 
 import numpy as np
 import pytest
@@ -54,6 +57,25 @@ def other_errors(path):
     with np.load(path) as file:
         members = dict(file)
     np.savez(path, **members | {"lod_error": members["lod_error"] / 2})
+
+
+def test_a_glb_that_refers_to_files_is_read_again(folder, tmp_path):
+    ball = trimesh.creation.icosphere(3)
+    views = [{"buffer": 0, "byteLength": 12 * 642}, {"buffer": 0, "byteOffset": 12 * 642, "byteLength": 12 * 1280}]
+    accessors = [{"bufferView": 0, "componentType": 5126, "count": 642, "type": "VEC3"}]
+    accessors += [{"bufferView": 1, "componentType": 5125, "count": 3840, "type": "SCALAR"}]
+    tree = {"asset": {"version": "2.0"}, "nodes": [{"mesh": 0}], "accessors": accessors, "bufferViews": views}
+    tree |= {"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}]}
+    text = json.dumps(tree | {"buffers": [{"uri": "ball.bin", "byteLength": 12 * 1922}]}).encode()
+    text += b" " * (-len(text) % 4)
+    data = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text
+    for path, content in ((tmp_path / "a.glb", data), (tmp_path / "b.glb.gz", gzip.compress(data))):
+        path.write_bytes(content)
+        for radius in (1, 3):
+            points = (radius * ball.vertices).astype(np.float32)
+            (tmp_path / "ball.bin").write_bytes(points.tobytes() + ball.faces.astype(np.uint32).tobytes())
+            model = ab.Model.load(path)
+            assert np.abs(model.mesh_at(model.lod_max)[0]).max() == radius
 
 
 def test_a_file_that_comes_again_is_opened(folder, built, ball):

@@ -4,6 +4,7 @@ import gzip
 import io
 import math
 import struct
+import tracemalloc
 import zipfile
 from fractions import Fraction
 
@@ -21,7 +22,12 @@ COMB = [*COMB[:-1], (-2, 0)]
 TURNS = [(round(64 * r * math.cos(k / 3)), round(64 * r * math.sin(k / 3))) for r in (1, 2) for k in range(20)]
 SPIRAL = [(x * (k + 6), y * (k + 6)) for k, (x, y) in enumerate(TURNS[20:])]
 SPIRAL += [(x * (k + 6), y * (k + 6)) for k, (x, y) in reversed(list(enumerate(TURNS[:20])))]
+DOUBLED = [point for point in LETTER[5:] + LETTER[:5] for _ in range(2)]
+LINKED = [(0, 0), (9, 0), (9, 9), (0, 9), (0, 0), (1, 1), (1, 4), (4, 4), (5, 5)]  # two holes
+LINKED += [(5, 8), (8, 8), (8, 5), (5, 5), (4, 4), (4, 1), (1, 1)]
+NOTCHED = [(0, 0), (2**17, 0), (2**17, 2**17), (0, 2**17), (0, 2), (1, 1)]
 POLYGONS = {"letter": LETTER, "comb": COMB, "spiral": SPIRAL, "letter turned": LETTER[3:] + LETTER[:3]}
+POLYGONS |= {"doubled": DOUBLED, "linked holes": LINKED, "notched": NOTCHED}
 DAE = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1"><asset>
 <created>2020-01-01T00:00:00</created><modified>2020-01-01T00:00:00</modified></asset><library_geometries>
 <geometry id="g"><mesh><source id="p"><float_array id="a" count="{numbers}">{points}</float_array><technique_common>
@@ -144,9 +150,11 @@ def test_polygons_are_covered_once(tmp_path, name, shape):
     stem = {"archive.zip": "inside", "packed.ply.gz": "packed"}.get(name, name.split(".")[0])
     assert names == ["plate" if name.endswith(".dae") else stem]
     vertices, found, _ = scene.models[0].mesh_at(scene.models[0].lod_max)
-    for triangles in (mesh.vertices[mesh.faces], vertices[found]):
-        assert len(triangles) == 1 + count - 2 + 2
-        assert (triangles[[0, -2, -1]] >= [50, 0, 0]).all(), "faces keep the order of the file"
+    dropped = len(mesh.dropped_faces)
+    for triangles, fewer in ((mesh.vertices[mesh.faces], 0), (vertices[found], dropped)):
+        assert len(triangles) == 1 + count - 2 + 2 - fewer
+        quad = triangles[[0, -2, -1]]
+        assert (quad >= [50, 0, 0]).all() and (quad <= [51, 1, 0]).all(), "faces keep the order of the file"
         check_cover(triangles[1:-2], POLYGONS[shape])
 
 
@@ -190,8 +198,11 @@ def test_objects_of_dae(tmp_path):
 
 LATTICE = b'<?xml version="1.0"?><model xmlns:b="http://x/beamlattice/2017/02" requiredextensions="b"></model>'
 FACES, HEAD = [list(range(8))], ply(LETTER, [])
-BOX = trimesh.creation.box()
+BOX, PLATE = trimesh.creation.box(), dae(LETTER, polylist(FACES))
 BINARY, TEXT = BOX.export(file_type="stl"), BOX.export(file_type="stl_ascii").encode()
+
+MARKED = {kind: BOX.export(file_type=kind) for kind in ("obj", "off", "stl_ascii")}
+MARKED = {kind: text.encode() for kind, text in MARKED.items()} | {"ply": BOX.export(file_type="ply", encoding="ascii")}
 
 
 @pytest.mark.parametrize(
@@ -204,6 +215,7 @@ BINARY, TEXT = BOX.export(file_type="stl"), BOX.export(file_type="stl_ascii").en
         ("a.ply", ply(LETTER, FACES * 2)[:-30], "cut short|does not fit the header"),
         ("a.ply", HEAD.replace(b"vertex 8", b"vertex 99999999999"), "cut short: .* 8 are whole"),
         ("a.ply", ply(LETTER, FACES, "<").replace(b"face 1\n", b"face 4000000000\n"), "cut short"),
+        ("a.ply", ply(LETTER, FACES).replace(b" 2 0.5 0.5\n", b"\n"), "does not fit the header"),
         ("a.ply", HEAD, r"no faces \(it holds vertex\)"),
         ("a.ply", HEAD.replace(b"float x", b"float u"), "no vertices with x, y and z"),
         ("a.ply", HEAD.replace(b"float x", b"quaternion x"), "header line 'property quaternion x'"),
@@ -215,13 +227,21 @@ BINARY, TEXT = BOX.export(file_type="stl"), BOX.export(file_type="stl_ascii").en
         ("a.off", b"solid", "does not begin with OFF"),
         ("a.stl", BINARY[:90], "no faces: its header declares 12 facets"),
         ("a.stl", BINARY[:80] + bytes(4) + BINARY[84:], "declares 0 facets, and 12 would fit"),
+        ("a.stl", BINARY[:80] + bytes(4), "declares 0 facets, and 0 would fit"),
         ("a.stl", TEXT.replace(b"endloop", b"vertex 0 0 0\nendloop"), "a facet of 4 vertices"),
         ("a.dae", dae(LETTER, f"<polygons>{INPUT}<ph><p>0 1 2</p><h>3 4 5</h></ph></polygons>"), "'g' has .* holes"),
         ("a.dae", dae(LETTER, polylist(FACES).replace(">8<", ">7<")), "'g': its polygons have 7 corners"),
+        ("a.dae", PLATE.replace(b'stride="3"', b'stride="3" offset="3"'), "'g' has positions that are not X, Y and Z"),
+        ("a.dae", PLATE.replace(b'"X"', b'"W"').replace(b'"Z"', b'"X"').replace(b'"W"', b'"Z"'), "'g' has positions"),
         ("a.zip", zipped(off(LETTER, [[0, 1]])), "inside.off: line"),
         ("a.zip", zipped(b"", "b.txt"), "holds no mesh file"),
         ("a.3mf", zipped(LATTICE, "3D/3dmodel.model"), "requires the 3MF extension http://x/beamlattice/2017/02"),
         ("a.obj", b"o a\n" + obj(LETTER, [[0, 1, 8]]), "face 0 refers to vertex 8"),
+        (
+            "a.obj",
+            obj(LETTER, []) + b"surf 0 1 0 1 1 2 3 4\nl 1 2\n",
+            r"no faces \(left out free-form surfaces, lines\)",
+        ),
         ("a.step", b"ISO-10303-21;", "pip install cascadio"),
         ("a.usda", b"#usda 1.0", "read by scene_from_file"),
     ],
@@ -247,10 +267,13 @@ def test_damaged_files(tmp_path, name, data, message):
         ("a.stl", b"solid" + bytes(75) + BINARY[80:-60], 10, "cut short: 10 facets are read of the 12"),
         ("a.stl", BINARY + b"xyzzy", 12, "left out 5 bytes behind the 12 facets"),
         ("a.stl", TEXT[: TEXT.rindex(b"vertex") + 9], 11, "cut short: 11 facets are whole"),
+        ("a.stl", TEXT + bytes(3), 12, None),
+        *((f"a.{kind}", b"\xef\xbb\xbf" + data, len(BOX.faces), None) for kind, data in MARKED.items()),
         ("a.ply", ply(LETTER, FACES, "<") + b"more", 6, "left out what follows"),
         ("a.ply", ply(LETTER, FACES).replace(b"element face", b"element edge 0\nelement face"), 6, None),
         ("a.off", off(LETTER, FACES) + b"3 0 1 2\n", 6, "left out 1 lines"),
         ("a.obj", obj(LETTER, FACES) + b"l 1 2\np 3\n", 6, "left out lines, points"),
+        ("a.obj", obj(LETTER, FACES) + b"fo 1 2 3\nbsp 1 2\n", 6, "left out faces as 'fo', free-form surfaces"),
         ("a.zip", zipped(obj(LETTER, FACES), "a.obj", "b.obj.gz"), 6, "left out b.obj.gz"),
     ],
 )
@@ -281,6 +304,18 @@ def test_a_solid_of_stl_is_an_object(tmp_path):
     assert ab.Model.load(tmp_path / "a.stl").face_count == 24
 
 
+def test_members_of_archives(tmp_path):
+    """Files are looked for beside the member that names them; those that macOS hides are no meshes."""
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("__MACOSX/._a.stl", bytes([0, 5, 22, 7]) + bytes(100))
+        for folder, size in (("", 1), ("sub/", 2), ("sub/sub/", 3)):
+            for name, data in trimesh.Scene(trimesh.creation.box(extents=[size] * 3)).export(file_type="gltf").items():
+                archive.writestr(folder + name, data)
+    mesh = load_mesh(tmp_path / "a.zip")
+    sizes = np.ptp(mesh.vertices[mesh.faces].reshape(3, 36, 3), axis=1)
+    assert sizes.tolist() == [[1.0] * 3, [2.0] * 3, [3.0] * 3]
+
+
 # The limit.
 
 
@@ -299,6 +334,19 @@ def test_files_that_unpack_to_too_much_are_refused(tmp_path, name, monkeypatch):
     monkeypatch.setattr(unpack, "UNPACKED_RATIO", 10**6)
     if name in ("a.obj.gz", "a.zip"):
         assert len(load_mesh(tmp_path / name).faces) == 6
+
+
+@pytest.mark.parametrize("name", ["a.zip", "a.3mf"])
+def test_archives_that_lie_about_sizes(tmp_path, name):
+    data = bytearray(zipped(b"#" * 2**26, "a.model" if name == "a.3mf" else "a.obj"))
+    entry = data.index(b"PK\1\2")
+    data[entry + 24 : entry + 28] = struct.pack("<I", 100)
+    (tmp_path / name).write_bytes(data)
+    tracemalloc.start()
+    with pytest.raises(ab.MeshError, match="Bad CRC-32"):
+        load_mesh(tmp_path / name)
+    assert tracemalloc.get_traced_memory()[1] < 2**24
+    tracemalloc.stop()
 
 
 def test_declared_sizes_are_checked_before_arrays_are_made(tmp_path):

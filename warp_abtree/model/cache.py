@@ -9,7 +9,6 @@ import hashlib
 import os
 import re
 import stat
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ VARIABLE = "WARP_ABTREE_CACHE"
 SIZE_LIMIT = 2 << 30  # bytes in the folder; the models that were used least recently go
 KEY_DIGITS = 40
 _NAME = re.compile(rf"[0-9a-f]{{{KEY_DIGITS}}}\.npz")  # a folder that the user names may hold other files
-BUILDER = 4  # grows with each change of what is built of the same mesh
+BUILDER = 5  # grows with each change of what is built of the same mesh
 LEAST_FACES = 1_000  # smaller models are built as fast as opened
 SELF_CONTAINED = {"obj", "ply", "stl", "off", "glb"}  # other formats may refer to further files
 
@@ -46,13 +45,16 @@ def file_key(source, *options) -> str | None:
     if not isinstance(source, str | os.PathLike):
         return None
     path = Path(source)
-    kind = split_file_name(path)[1:]
-    if kind[0] not in SELF_CONTAINED or not path.is_file():  # what a pipe holds can be read once
+    _, kind, zipped = split_file_name(path)
+    if kind not in SELF_CONTAINED or not path.is_file():  # what a pipe holds can be read once
         return None
     try:
-        return _key([path.read_bytes()], kind, None if kind[0] == "obj" else version("trimesh"), *options)
+        data = path.read_bytes()
     except OSError:
         return None
+    if kind == "glb" and (zipped or b'"uri"' in data):
+        return None
+    return _key([data], (kind, zipped), *options)
 
 
 def mesh_key(mesh, *options) -> str:

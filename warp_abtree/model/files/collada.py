@@ -32,9 +32,9 @@ def read_collada(data: bytes, where: str, remarks: Remarks):
         if not any(word in broken.lower() for word in COLLADA_LOOKS):
             remarks.add("left out what is broken:", broken)
     for geometry in file.geometries:
-        if geometry.xmlnode is not None and any(str(node.tag).endswith("}ph") for node in geometry.xmlnode.iter()):
-            raise MeshError(f"{where}: geometry {geometry.id!r} has polygons with holes (<ph>), which are not read")
-    made, known = trimesh.Scene(), {}
+        if geometry.xmlnode is not None:
+            _check_layout(geometry, where)
+    made, known, counts = trimesh.Scene(), {}, {}
     open_nodes = [(node, np.eye(4), None) for node in reversed(file.scene.nodes if file.scene else [])]
     while open_nodes:
         node, above, name = open_nodes.pop()
@@ -52,9 +52,25 @@ def read_collada(data: bytes, where: str, remarks: Remarks):
                 if known[geometry.id] is not None:
                     made.geometry[geometry.id] = known[geometry.id]
             if known[geometry.id] is not None:
-                frame = trimesh.util.unique_name(name or geometry.id, made.graph.nodes)
+                frame = trimesh.util.unique_name(name or geometry.id, made.graph.nodes, counts)
                 made.graph.update(frame, geometry=geometry.id, matrix=above)
     return made
+
+
+def _check_layout(geometry, where):
+    """Refuse what pycollada passes over: holes of polygons, and numbers between or before those of the positions."""
+    tree = geometry.xmlnode
+    if tree.find(".//{*}ph") is not None:
+        raise MeshError(f"{where}: geometry {geometry.id!r} has polygons with holes (<ph>), which are not read")
+    places = {node.get("source") for node in tree.iterfind("{*}mesh/{*}vertices/{*}input[@semantic='POSITION']")}
+    for source in tree.iterfind("{*}mesh/{*}source"):
+        found = source.find("{*}technique_common/{*}accessor")
+        if found is None or f"#{source.get('id')}" not in places:
+            continue
+        names = "".join(node.get("name", "") for node in found.iterfind("{*}param"))
+        turned = sorted(names) == list("XYZ") and names != "XYZ"
+        if turned or found.get("stride", "3") != "3" or found.get("offset", "0") != "0":
+            raise MeshError(f"{where}: geometry {geometry.id!r} has positions that are not X, Y and Z side by side")
 
 
 def _read_geometry(geometry, where, remarks):

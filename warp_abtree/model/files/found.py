@@ -62,7 +62,7 @@ class FileSurface:
         """Return a trimesh.Scene with a node of each part that has faces, those without a name called by one."""
         import trimesh
 
-        scene = trimesh.Scene()
+        scene, counts = trimesh.Scene(), {}
         for part, own in enumerate(self.names):
             faces = self.faces if self.parts is None else self.faces[self.parts == part]
             if len(faces):
@@ -71,6 +71,6 @@ class FileSurface:
                     used, corners = np.unique(faces, return_inverse=True)
                     vertices, faces = vertices[used], corners.reshape(-1, 3)
                 mesh = trimesh.Trimesh(vertices, faces, process=False)
-                title = trimesh.util.unique_name(own or name, scene.geometry)
+                title = trimesh.util.unique_name(own or name, scene.geometry, counts)
                 scene.add_geometry(mesh, node_name=title, geom_name=title)
         return scene

@@ -104,6 +104,8 @@ class _Reader:
                 self.remarks.add("left out", f"{name} (invisible)")
                 continue
             pose = above @ _matrix(node)
+            if not (pose[3] == [0, 0, 0, 1]).all():
+                raise MeshError(f"{self.where}: node {name!r}: its transform is not affine")
             open_nodes += [(child, pose) for child in reversed(node.get("children", ()))]
             geometry = self._mesh(node["mesh"], made) if "mesh" in node else None
             if geometry is None:
@@ -160,6 +162,8 @@ class _Reader:
             if vertices.shape[1:] != (3,):
                 raise MeshError(f"{where}: its positions have {vertices[:1].size} numbers, not 3")
             corners = self._accessor(primitive["indices"]) if "indices" in primitive else np.arange(len(vertices))
+        if corners.dtype.kind not in "iu":
+            raise MeshError(f"{where}: its indices are no integers")
         corners = corners.reshape(-1).astype(np.int64)
         if len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices):
             raise MeshError(f"{where}: refers to vertex {corners.max()}, but there are {len(vertices)}")

@@ -1,7 +1,5 @@
 """OBJ files in the order of their faces, a part an object (`o`)."""
 
-import codecs
-
 import numpy as np
 
 from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
@@ -10,7 +8,8 @@ from warp_abtree.model.files.polygons import triangulate
 # How lines of plain OBJ files begin; in others, a `v` or `f` might stand behind a tab, say.
 PLAIN_STARTS = {b"", b"v ", b"f ", b"vn", b"vt", b"# ", b"#", b"o ", b"g ", b"s ", b"us", b"mt"}
 LEFT_OUT = {b"p": "points", b"l": "lines", b"curv": "curves", b"curv2": "curves", b"surf": "free-form surfaces"}
-LEFT_OUT |= {b"call": "called files"}
+LEFT_OUT |= {b"call": "called files", b"fo": "faces as 'fo'", b"cdc": "curves", b"cdp": "free-form surfaces"}
+LEFT_OUT |= {b"bsp": "free-form surfaces", b"bzp": "free-form surfaces"}
 
 
 def _parse_plain_obj(data) -> FileSurface | None:
@@ -69,7 +68,6 @@ class _Parts:
 
 def read_obj(data: bytes, where: str, remarks: Remarks) -> FileSurface:
     """Return what an OBJ file holds; raise MeshError with the line that cannot be read."""
-    data = data.removeprefix(codecs.BOM_UTF8)
     plain = _parse_plain_obj(data)
     if plain is not None:
         return plain
@@ -106,7 +104,7 @@ def read_obj(data: bytes, where: str, remarks: Remarks) -> FileSurface:
         corners.extend(polygon)
         counts.append(len(polygon))
     if not counts:
-        raise MeshError(f"{where}: no faces")
+        raise MeshError(f"{where}: no faces" + (f" ({remarks})" if str(remarks) else ""))
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
     try:
         indices = np.array(corners, dtype=np.int64) - 1

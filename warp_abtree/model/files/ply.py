@@ -151,7 +151,7 @@ def _read_text(lines, _, element, where):
                 kind = element.properties[name][1]
                 read = np.array(list(map(float, values)), kind) if kind[0] == "f" else np.array(list(map(int, values)))
                 columns[name] = (np.array(lengths[name], np.int64), read) if name in lengths else read
-    except (ValueError, OverflowError):
+    except (ValueError, IndexError, OverflowError):
         raise MeshError(
             f"{where}: cannot be read as ply: a line of the {element.count} {element.name!r} does not fit the header"
         ) from None

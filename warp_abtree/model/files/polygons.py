@@ -1,5 +1,7 @@
 """Polygons, strips and fans as triangles: one triangulation for all files."""
 
+from collections import deque
+
 import numpy as np
 
 from warp_abtree.model.files.found import MeshError
@@ -35,7 +37,10 @@ def triangulate(vertices, counts, corners, where):
         a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
         cross = np.cross(b - a, c - a)
         area = np.add.reduceat(cross, triangle_start)
-        fold = np.einsum("ij,ij->i", cross, area[polygon]) < -1e-9 * np.einsum("ij,ij->i", area, area)[polygon]
+        size = np.sqrt(np.einsum("ij,ij->i", area, area))[polygon]
+        # Rounding, of thin polygons and of small notches in large ones.
+        least = 1e-9 * size * np.minimum(size, np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1))
+        fold = np.einsum("ij,ij->i", cross, area[polygon]) < -least
     for p in np.unique(polygon[fold]):
         ring = corners[polygon_start[p] : polygon_start[p] + counts[p]]
         drop = np.argmax(np.abs(area[p]))
@@ -53,25 +58,52 @@ def cut_strip(corners):
 
 
 def _clip_ears(points):
-    """Cut a counterclockwise polygon of the plane into triangles that do not fold; return their corners."""
+    """Cut a counterclockwise polygon whose fan folds into triangles that do not; return their corners.
 
-    def turn(i, j, k):
-        (ax, ay), (bx, by), (cx, cy) = points[i], points[j], points[k]
-        return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-
-    points = list(map(tuple, points.tolist()))
-    ring, triangles = list(range(len(points))), []
-    while len(ring) > 3:
-        candidates = list(zip(ring[-1:] + ring[:-1], ring, ring[1:] + ring[:1]))
-        for i, j, k in candidates:
-            others = [x for x in ring if points[x] not in (points[i], points[j], points[k])]
-            if turn(i, j, k) > 0.0 and not any(
-                turn(i, j, x) >= 0.0 and turn(j, k, x) >= 0.0 and turn(k, i, x) >= 0.0 for x in others
-            ):
-                break
+    Corners may repeat, and edges touch, as where cuts join a polygon's holes to its outline.
+    """
+    count = len(points)
+    if count == 4:
+        return [(3, 0, 1), (1, 2, 3)]  # the fan from corner 0 folds
+    before, after = np.roll(np.arange(count), 1), np.roll(np.arange(count), -1)
+    left, triangles = np.ones(count, bool), []
+    queue, all_asked = deque(range(count)), True
+    while len(triangles) < count - 2:
+        if queue:
+            j = queue.popleft()
+            if not left[j] or not _is_ear(points, np.flatnonzero(left), before[j], j, after[j], after):
+                continue
         else:
-            # No ear: the polygon crosses itself, or is flat to rounding. Any cut will do.
-            i, j, k = max(candidates, key=lambda corner: turn(*corner))
+            # No ear: corners without area first, which may free others; what crosses itself is cut anyhow.
+            ring = np.flatnonzero(left)
+            turns = _turn(points[before[ring]], points[ring], points[after[ring]])
+            flat = (turns == 0.0).any()
+            if not flat and not all_asked:
+                queue, all_asked = deque(ring), True
+                continue
+            j, all_asked = ring[np.argmax(turns == 0.0 if flat else turns)], not flat
+        i, k = before[j], after[j]
         triangles.append((i, j, k))
-        ring.remove(j)
-    return [*triangles, tuple(ring)]
+        left[j], after[i], before[k] = False, k, i
+        queue += i, k  # a cut makes no other ears
+    return triangles
+
+
+def _is_ear(points, ring, i, j, k, after) -> bool:
+    """Return whether a triangle at corner j turns left, or is a point that repeats, and no edge enters it."""
+    corners = points[[i, j, k]]
+    if (corners[1] == corners[::2]).all(axis=1).any():
+        return True
+    if not _turn(*corners) > 0.0:
+        return False
+    outside = _turn(corners[:, None], corners[[1, 2, 0], None], points) <= 0.0
+    sides = _turn(points[ring, None], points[after[ring], None], corners)
+    beyond = (outside[:, ring] & outside[:, after[ring]]).any(axis=0)
+    return bool((beyond | (sides >= 0.0).all(axis=1) | (sides <= 0.0).all(axis=1)).all())
+
+
+def _turn(a, b, c):
+    """Return twice the area of triangles of the plane, negative where they turn right, 0 within rounding."""
+    u, v = b - a, c - a
+    p, q = u[..., 0] * v[..., 1], u[..., 1] * v[..., 0]
+    return np.where(np.abs(p - q) <= 2.0**-50 * (np.abs(p) + np.abs(q)), 0.0, p - q)

@@ -1,5 +1,6 @@
 """Mesh files of all formats: our own readers where polygons, parts or what is left out matter, trimesh for the rest."""
 
+import codecs
 import io
 import re
 import warnings
@@ -14,7 +15,7 @@ from warp_abtree.model.files.obj import read_obj
 from warp_abtree.model.files.off import read_off
 from warp_abtree.model.files.ply import read_ply
 from warp_abtree.model.files.stl import read_stl
-from warp_abtree.model.files.unpack import gunzip, open_zip
+from warp_abtree.model.files.unpack import gunzip, unzip
 
 SURFACES = {"obj": read_obj, "ply": read_ply, "off": read_off, "stl": read_stl, "stl_ascii": read_stl}
 USD = ("usd", "usda", "usdc", "usdz")
@@ -57,19 +58,16 @@ def read_file(path: Path, remarks: Remarks):
             data = gunzip(data, str(path))
     except (OSError, EOFError, zlib.error) as error:
         raise MeshError(f"{path}: cannot be read: {first_line(error)}") from None
-    if kind in SURFACES:
-        return SURFACES[kind](data, str(path), remarks)
-    from trimesh.resolvers import FilePathResolver
-
-    return _read_data(data, kind, str(path), FilePathResolver(str(path)), remarks)
+    return _read_data(data, kind, str(path), None, remarks)
 
 
 def _read_data(data, kind, where, resolver, remarks):
-    """Return what the bytes of a file hold, as `read_file` does."""
-    import trimesh
-
+    """Return what the bytes of a file hold, as `read_file` does; without a resolver, `where` is its path."""
     if kind in SURFACES:
-        return SURFACES[kind](data, where, remarks)
+        return SURFACES[kind](data.removeprefix(codecs.BOM_UTF8), where, remarks)
+    import trimesh  # takes as long as the rest of the library
+
+    resolver = trimesh.resolvers.FilePathResolver(where) if resolver is None else resolver
     if kind in ("glb", "gltf"):
         return read_gltf(data, where, resolver, remarks)
     if kind == "dae":
@@ -83,9 +81,9 @@ def _read_data(data, kind, where, resolver, remarks):
         raise MeshError(f"{where}: cannot be read: unknown extension '{kind}'; known here: {' '.join(sorted(known))}")
     try:
         if kind in ("zip", "zae"):
-            return _read_archive(open_zip(data, where), where, remarks)
+            return _read_archive(unzip(data, where), where, remarks)
         if kind in ("3mf", "3dxml"):
-            _check_extensions(open_zip(data, where), where)
+            _check_extensions(unzip(data, where), where)
         with warnings.catch_warnings():
             # Older NumPy only warns where a number in a text file cannot be read, and cuts the file short there.
             warnings.filterwarnings("error", message="string or file could not be read")
@@ -96,10 +94,10 @@ def _read_data(data, kind, where, resolver, remarks):
         raise MeshError(f"{where}: cannot be read as {kind}: {first_line(error)}") from None
 
 
-def _check_extensions(archive, where):
+def _check_extensions(members, where):
     """Refuse a 3MF file that requires an extension which trimesh passes over, such as beam lattices."""
-    for name in archive.namelist():
-        root = re.search(rb"<(\w+:)?model\b[^>]*>", archive.read(name)) if name.lower().endswith(".model") else None
+    for name, data in members.items():
+        root = re.search(rb"<(\w+:)?model\b[^>]*>", data) if name.lower().endswith(".model") else None
         text = root[0] if root else b""
         required = re.search(rb"""requiredextensions\s*=\s*["']([^"']*)""", text)
         for prefix in required[1].split() if required else ():
@@ -109,23 +107,26 @@ def _check_extensions(archive, where):
                 raise MeshError(f"{where}: requires the 3MF extension {title}, which is not read")
 
 
-def _read_archive(archive, where, remarks):
-    """Return the mesh files of a zip archive in one scene."""
+def _read_archive(members, where, remarks):
+    """Return the mesh files of a zip archive in one scene, but for hidden ones, such as macOS adds to each file."""
     import trimesh
 
-    members = {member.filename: archive.read(member) for member in archive.infolist() if not member.is_dir()}
-    resolver = trimesh.resolvers.ZipResolver({name: io.BytesIO(data) for name, data in members.items()})
-    merged = trimesh.Scene()
+    merged, counts = trimesh.Scene(), {}
     for name, data in members.items():
         stem, kind, zipped = split_file_name(Path(name))
+        if Path(name).name.startswith("."):
+            continue
         if zipped or kind in {*USD, *UNREAD, "zip"}:
             remarks.add("left out", name)
         elif kind in trimesh.available_formats() or kind in NEEDED:
+            folder = name[: name.rfind("/") + 1]
+            beside = {key.removeprefix(folder): other for key, other in members.items() if key.startswith(folder)}
+            resolver = trimesh.resolvers.ZipResolver(beside)
             found = _read_data(data, kind, f"{where}: {name}", resolver, remarks)
             scene = found.as_scene(stem) if isinstance(found, FileSurface) else found
             for node in scene.graph.nodes_geometry:
                 pose, part = scene.graph[node]
-                title = trimesh.util.unique_name(node, merged.graph.nodes)
+                title = trimesh.util.unique_name(node, merged.graph.nodes, counts)
                 merged.add_geometry(scene.geometry[part], title, f"{name}: {part}", transform=pose)
     if not merged.geometry:
         raise MeshError(f"{where}: holds no mesh file")

@@ -11,14 +11,15 @@ STL_HEADER = 84  # bytes of text and count
 def read_stl(data: bytes, where: str, remarks: Remarks) -> FileSurface:
     """Return what an STL file holds, a part a solid; raise MeshError where it is neither text nor binary."""
     whole = len(data) >= STL_HEADER and len(data) == STL_HEADER + FACET.itemsize * _facet_count(data)
-    if not whole and data.lstrip()[:5].lower() == b"solid" and b"\0" not in data:
+    spoken = b"\0" not in data or b"endfacet" in data.lower()
+    if not whole and data.lstrip()[:5].lower() == b"solid" and spoken:
         return _read_text(data, where, remarks)
     if len(data) < STL_HEADER:
         raise MeshError(f"{where}: cannot be read as stl: {len(data)} bytes, and no text that begins with 'solid'")
     count, there = _facet_count(data), (len(data) - STL_HEADER) // FACET.itemsize
+    if min(count, there) == 0:
+        raise MeshError(f"{where}: no faces: its header declares {count:,} facets, and {there:,} would fit")
     if not whole:
-        if min(count, there) == 0:
-            raise MeshError(f"{where}: no faces: its header declares {count:,} facets, and {there:,} would fit")
         if there < count:
             remarks.add("cut short:", f"{there:,} facets are read of the {count:,} that its header declares")
         else:

@@ -30,10 +30,15 @@ def gunzip(data: bytes, where: str) -> bytes:
     return found
 
 
-def open_zip(data: bytes, where: str) -> zipfile.ZipFile:
-    """Return an open zip archive; raise MeshError beyond the limit, and what zipfile raises for damaged data."""
+def unzip(data: bytes, where: str) -> dict[str, bytes]:
+    """Return the members of a zip archive; raise MeshError beyond the limit, and what zipfile raises for damage."""
     archive = zipfile.ZipFile(io.BytesIO(data))
-    # No more is read of a member than it declares.
-    if exceeds_limit(sum(member.file_size for member in archive.infolist()), len(data)):
+    members = [member for member in archive.infolist() if not member.is_dir()]
+    if exceeds_limit(sum(member.file_size for member in members), len(data)):
         raise MeshError(f"{where}: {limit_message(len(data))}; unpack it yourself")
-    return archive
+    found = {}
+    for member in members:
+        with archive.open(member) as file:
+            # Without a size, it would unpack more than is declared before it looks.
+            found[member.filename] = file.read(member.file_size)
+    return found
