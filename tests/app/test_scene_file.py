@@ -254,6 +254,9 @@ def test_what_is_wrong_is_said(tmp_path, text, message):
         M.format('shape = "revolve"\nsections = 3\nprofile = [[1, -1e308], [1, 1e308]]'),
         M.format('shape = "icosphere"\nscale = 1e308\nradius = 1e9'),
         ONE + "count = 50\nposition = [1.7e308, 0, 0]\nrandom = { position = [1.7e308, 0, 0] }\n",
+        ONE + "[scene]\ntime_step = 1e308\n",
+        ONE + "[[lod_sweep]]\nmodel = 'ball'\nfrom = 1.0\nto = 0.5\nperiod = 1e-320\n",
+        ONE + "[[lod_sweep]]\nmodel = 'ball'\nfrom = 1e-320\nto = 1.0\nperiod = 1.0\n",
         ONE + "[camera]\neye = [1e308, 0, 0]\ntarget = [-1e308, 0, 0]\n",
     ],
 )
