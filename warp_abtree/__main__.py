@@ -1,8 +1,9 @@
 """Run the command line: ``warp-abtree`` or ``python -m warp_abtree``.
 
-What needs no Warp stands here: the version, and signals while the library is being imported.
+What needs no Warp stands here: the version, and signals while the library is being imported and after the command.
 """
 
+import atexit
 import os
 import signal
 import sys
@@ -14,12 +15,16 @@ def main() -> int:
     from warp_abtree.checks.version import __version__
 
     handle_signals(end_process, end_process)
+    atexit.register(handle_signals, signal.SIG_IGN, signal.SIG_IGN)  # the last to be called: what is left is short
     if sys.argv[1:] == ["--version"]:
         print(f"warp-abtree {__version__}")
         return 0
     from warp_abtree.app.cli.main import main as run
 
-    return run()
+    try:
+        return run()
+    finally:
+        handle_signals(end_process, end_process)
 
 
 def end_process(number, frame):

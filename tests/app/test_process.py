@@ -192,10 +192,52 @@ def test_the_version_needs_no_warp():
         ("warp", INTERRUPT, (130, "", "warp-abtree: interrupted\n")),
         ("scipy.sparse", INTERRUPT, (130, "", "warp-abtree: interrupted\n")),
         ("trimesh", TERMINATE, (143, "", "warp-abtree: terminated\n")),
+        ("trimesh.exchange.gltf", INTERRUPT, (130, "", "warp-abtree: interrupted\n")),
+        ("pxr", INTERRUPT, (130, "", "warp-abtree: interrupted\n")),  # of a command that runs already
+        ("pxr", TERMINATE, (143, "", "warp-abtree: terminated\n")),
     ],
 )
 def test_a_signal_during_imports_is_not_caught(module, number, told):
-    assert run_process("info ball.obj", STOP_AT, STOP_AT=module, NUMBER=str(number.value)) == told
+    assert run_process("info warp:bunny", STOP_AT, STOP_AT=module, NUMBER=str(number.value)) == told
+
+
+# A signal comes while a finaliser runs, of which Python drops what is raised, or at the end of the process.
+STOP_IN_DEL = """
+import atexit, os, signal, sys
+from warp_abtree.__main__ import main
+from warp_abtree.app.cli import model_commands
+
+class Thing:
+    def __del__(self, kill=os.kill, number=os.getpid()):
+        kill(number, 2)
+
+def describe(mesh, described=model_commands.describe_mesh):
+    thing = Thing()
+    del thing
+    import time
+    time.sleep(30)
+
+def print_last(*result, print_result=model_commands.print_result):
+    print_result(*result)
+    atexit.register(os.kill, os.getpid(), 2)
+
+PLACE
+sys.exit(main())
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [
+        ("model_commands.describe_mesh = describe", (130, False, "warp-abtree: interrupted\n")),
+        ("model_commands.print_result = print_last", (130, True, "warp-abtree: interrupted\n")),
+        ("sys.kept = Thing()", (0, True, "")),  # after the last Python code: done is done
+    ],
+)
+def test_a_signal_while_something_ends_is_not_dropped(files, place, told):
+    status, shown, errors = run_process("info ball.obj --device cpu", STOP_IN_DEL.replace("PLACE", place))
+    assert (status, "diagonal" in shown, errors) == told
 
 
 def test_a_warning_is_one_line(files):

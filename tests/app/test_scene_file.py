@@ -246,6 +246,25 @@ def test_what_is_wrong_is_said(tmp_path, text, message):
     assert len(str(caught.value).splitlines()) == 1
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "text",
+    [
+        M.format('shape = "icosphere"\nradius = 1e308'),
+        M.format('shape = "revolve"\nsections = 3\nprofile = [[1, -1e308], [1, 1e308]]'),
+        M.format('shape = "icosphere"\nscale = 1e308\nradius = 1e9'),
+        ONE + "count = 50\nposition = [1.7e308, 0, 0]\nrandom = { position = [1.7e308, 0, 0] }\n",
+        ONE + "[scene]\ntime_step = 1e308\n",
+        ONE + "[[lod_sweep]]\nmodel = 'ball'\nfrom = 1.0\nto = 0.5\nperiod = 1e-320\n",
+        ONE + "[[lod_sweep]]\nmodel = 'ball'\nfrom = 1e-320\nto = 1.0\nperiod = 1.0\n",
+        ONE + "[camera]\neye = [1e308, 0, 0]\ntarget = [-1e308, 0, 0]\n",
+    ],
+)
+def test_numbers_that_overflow_are_told_in_one_line(tmp_path, text):
+    with pytest.raises(SceneError):
+        load(tmp_path, text)
+
+
 def test_file_that_is_none(tmp_path):
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
     for path, message in ((tmp_path / "gone.toml", ""), (tmp_path, ""), (tmp_path / "bytes.toml", ": not valid TOML")):
@@ -269,6 +288,11 @@ def deep(count, value="1"):
         (ONE + "[" + deep(5000).replace(" = 1", "]"), "line 6: a key nested"),
         (ONE + "random = { " + deep(5000).strip() + " }", "line 6: a key nested"),
         (ONE + "# " + 5000 * "." + "\nlod = 0.5 # " + 5000 * "." + "\n" + deep(5000), "line 8: a key nested"),
+        (ONE + "'#'." + deep(20), "line 6: a key nested"),
+        (ONE + '[objects."a\'#".' + deep(20).replace(" = 1", "]"), "line 6: a key nested"),
+        (ONE + 2**18 * "[a]\n", "the file: has more than 262,144 tables"),
+        (ONE + "".join(f"{deep(16)}\n" for _ in range(2**15)), "the file: has more than 262,144 tables"),
+        (ONE + "x = [" + 2**18 * "{}," + "]", "the file: has more than 262,144 tables"),
         (ONE + "position = [\n0,\n" + 5000 * "[" + 5000 * "]" + "]", "line 8: nested more than 16 deep"),
         (ONE + "x = " + 5000 * "{a=" + "1" + 5000 * "}", "line 6: nested more than 16 deep"),
         (ONE + 'model = "' + 10**6 * "x" + '"\n', "not valid TOML"),
@@ -295,6 +319,19 @@ def test_what_is_too_much_is_refused_at_once(tmp_path, monkeypatch, text, messag
         load(tmp_path, text)
     told = str(caught.value)
     assert told.startswith(str(tmp_path / "scene.toml")) and message in told and len(told) < 700 and "\n" not in told
+
+
+@pytest.mark.parametrize("title", ['"{}"', "'#{}'", '"""\n#" ""{}"""""', "'''\n\"#{}''''", '"#\\"{}"', "1.5 # '\"{}"])
+def test_dots_of_strings_and_comments_are_no_keys(tmp_path, monkeypatch, title):
+    monkeypatch.setattr(decode, "TABLE_LIMIT", 6)  # [models.ball], [[objects]] and what stands below
+    key = "title" if "1.5" not in title else "time_step"
+    load(tmp_path, ONE + f"velocity = [1.5, 2.5, 3.5]\n[scene]\n{key} = {title.format(40 * 'a.[')}\nseed = 3\n")
+
+
+def test_a_byte_order_mark_is_left_out(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + ONE.replace("\n", "\r\n").encode())
+    assert load_scene(path, device="cpu").scene.object_count == 1
 
 
 def test_a_file_of_any_size_is_not_read_whole(tmp_path, monkeypatch):

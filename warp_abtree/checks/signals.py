@@ -1,7 +1,32 @@
 """SIGINT and SIGTERM of a command."""
 
+import os
 import signal
 import threading
+
+IMPORTS = "<frozen importlib._bootstrap>"  # the code that runs while a module is imported
+DELAY = 0.05  # seconds after which a signal comes again
+
+
+def not_swallowed(handler):
+    """Return a handler that lets a signal come again until no import and no `__del__` runs.
+
+    These swallow what a handler raises.
+    """
+
+    def handle(number, frame):
+        caller = frame
+        while caller is not None:
+            if caller.f_code.co_filename == IMPORTS or caller.f_code.co_name == "__del__":
+                send = (signal.raise_signal, [number]) if os.name == "nt" else (os.kill, [os.getpid(), number])
+                again = threading.Timer(DELAY, *send)
+                again.daemon = True
+                again.start()
+                return
+            caller = caller.f_back
+        handler(number, frame)
+
+    return handle
 
 
 def handle_signals(interrupt, terminate):

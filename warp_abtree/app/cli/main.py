@@ -18,7 +18,7 @@ from warp_abtree.app.cli.arguments import EXIT_STATUS, PROGRAM, Parser, PrintCom
 from warp_abtree.app.cli.progress import Progress, compile_notice, start_warp
 from warp_abtree.app.pictures import command as picture_command
 from warp_abtree.app.viewer import command as view_command
-from warp_abtree.checks.signals import handle_signals
+from warp_abtree.checks.signals import handle_signals, not_swallowed
 from warp_abtree.checks.version import __version__
 
 
@@ -84,7 +84,7 @@ def main(argv=None) -> int:
     progress = Progress()
     try:
         if argv is None:
-            handle_signals(signal.default_int_handler, terminate)
+            handle_signals(not_swallowed(signal.default_int_handler), not_swallowed(terminate))
             warnings.formatwarning = lambda message, *_, **__: f"{PROGRAM}: {message}\n"
         argv = list(sys.argv[1:] if argv is None else argv)
         if argv[:1] == ["bench"] and argv[1:] not in (["-h"], ["--help"]):

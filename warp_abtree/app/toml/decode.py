@@ -9,7 +9,14 @@ from warp_abtree.app.toml.folder import scene_names
 
 FILE_SIZE_LIMIT = 2**24  # bytes of a file
 DEPTH_LIMIT = 16  # of tables and lists in one another
-DOT_LIMIT = 1000  # in a key: the parser takes the square of their number
+TABLE_LIMIT = 2**18  # of a file, those that dotted keys make among them; the parser takes 1 KB for one
+# Strings and comments, those without an end among them: all in one pass, without going back.
+_QUOTED = re.compile(
+    r'"""(?:[^"\\]|\\.|"(?!""))*+"{0,5}|"(?:[^"\\\n]|\\.)*+"?'
+    r"|'''(?:[^']|'(?!''))*+'{0,5}|'[^'\n]*+'?|#[^\n]*+",
+    re.S,
+)
+_PIECE = re.compile(r"(^[ \t]*\[)?[^\n=,\[\]{}]+(=?)|\{", re.M)  # a header, a key, a value, or an inline table
 NO_SCENE = "is no scene file, which is TOML (.toml); info, query, view and picture take meshes and models"
 TOML_TYPES = {
     "object": "a table",
@@ -69,7 +76,7 @@ def _parse(path, msgspec, text: str | None):
     """Return the TOML of a file, or of `text` in its place, as dictionaries and lists."""
     if text is None:
         with open(path, "rb") as file:
-            text = file.read(FILE_SIZE_LIMIT + 1).decode()
+            text = file.read(FILE_SIZE_LIMIT + 1).decode("utf-8-sig")  # some editors write a mark in front
     _check_text(path, text)
     try:
         return msgspec.toml.decode(text)
@@ -78,13 +85,20 @@ def _parse(path, msgspec, text: str | None):
 
 
 def _check_text(path, text: str):
-    """Refuse what the parser would take too long for."""
+    """Refuse what the parser would take too long or too much memory for."""
     if len(text) > FILE_SIZE_LIMIT:
         fail(path, "the file", f"has more than {FILE_SIZE_LIMIT:,} bytes")
-    for number, line in enumerate(text.splitlines(), start=1):
-        parts = line.partition("#")[0].replace(",", "=").split("=")
-        if max(part.count(".") for part in parts) > DOT_LIMIT:
-            fail(path, f"line {number}", f"a key nested more than {DEPTH_LIMIT} deep")
+    bare = _QUOTED.sub(lambda found: "'" + "\n" * found[0].count("\n"), text)
+    tables = 0
+    for found in _PIECE.finditer(bare):
+        dots = found[0].count(".")
+        if dots > DEPTH_LIMIT:
+            line = bare.count("\n", 0, found.start()) + 1
+            fail(path, f"line {line}", f"a key nested more than {DEPTH_LIMIT} deep")
+        head = found[1] is not None or found[0] == "{"
+        tables += head + (dots if head or found[2] else 0)
+    if tables > TABLE_LIMIT:
+        fail(path, "the file", f"has more than {TABLE_LIMIT:,} tables")
 
 
 def _deepest_line(text: str) -> int:

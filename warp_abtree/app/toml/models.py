@@ -52,8 +52,7 @@ def build_model(path: Path, name: str, table, progress=None) -> Model:
         vertices = mesh.vertices - (lower / 2 + upper / 2) if table.centre else mesh.vertices
         factor = (table.scale or 1.0) if table.size is None else table.size / float((upper - lower).max())
         if table.centre or factor != 1.0:
-            with np.errstate(over="ignore"):
-                mesh = mesh_from_arrays(vertices * factor, mesh.faces, name=mesh.name)
+            mesh = mesh_from_arrays(vertices * factor, mesh.faces, name=mesh.name)
         if table.faces is not None:
             mesh = _bring_to(mesh, table.faces, progress)
         return Model.load(mesh, table.base_faces, progress, orient=table.orient)

@@ -106,6 +106,7 @@ class SceneFile:
         return frame
 
 
+@np.errstate(all="ignore")  # what is not finite is refused, with its key
 def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None, text=None) -> SceneFile:
     """Read a scene file, build its models and place its objects.
 

@@ -28,6 +28,8 @@ T = TypeVar("T")
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
 Fraction = Annotated[float, Meta(gt=0, le=1)]
+Share = Annotated[float, Meta(ge=1e-9, le=1)]  # of the faces: quotients of two stay finite
+Span = Annotated[float, Meta(ge=1e-9, le=1e9)]  # of time [s]
 Count = Annotated[int, Meta(ge=1, le=2**31 - 1)]
 Bits = Annotated[int, Meta(ge=0, le=ALL_BITS)]
 Cells = Annotated[int, Meta(ge=0, le=OBJECT_LIMIT)]
@@ -55,7 +57,7 @@ class HeadTable(Table):
 
     title: str | None = None  # the file's name without its suffix by default
     frames: Count = 60  # that `run` makes
-    time_step: Positive = 1 / 60  # between frames
+    time_step: Span = 1 / 60  # between frames
     seed: Annotated[int, Meta(ge=0, le=2**31 - 1)] = 0  # of everything under `random`
 
 
@@ -232,9 +234,9 @@ class SweepTable(Table, kw_only=True):
 
     model: str | None = None  # all objects of a model, or
     objects: str | NonEmpty[str] | None = None  # those of these names
-    start: Fraction = field(name="from")  # of the faces
-    turn: Fraction = field(name="to")
-    period: Positive  # there and back
+    start: Share = field(name="from")
+    turn: Share = field(name="to")
+    period: Span  # there and back
 
     def __post_init__(self):
         if (self.model is None) == (self.objects is None):
