@@ -284,3 +284,19 @@ def test_the_broad_phase_finds_what_lods_leave_out(device):
     found = scene.intersect(output="distance", originals=True)
     np.testing.assert_array_equal(found.pairs, [[0, 1]])
     assert 0 < found.distance[0] < 0.15 and found.bracket[0, 1] < 0.15
+
+
+def test_the_broad_phase_of_originals_follows_filters_and_poses(device):
+    ball = sample("ball")
+    scene = ab.Scene(device)
+    for x in (0.0, 0.5, 0.9):
+        scene.add(ball, (x, 0, 0, 0, 0, 0, 1), lod=0)
+
+    def pairs(**options):
+        return scene.intersect(output="distance", originals=True, **options).pairs.tolist()
+
+    assert pairs() == [[0, 1], [0, 2], [1, 2]]
+    scene.filter([(0, 1)])
+    assert pairs() == [[0, 2], [1, 2]]
+    scene.set_poses(np.array([[0, 0, 0, 0, 0, 0, 1], [50, 0, 0, 0, 0, 0, 1], [90, 0, 0, 0, 0, 0, 1.0]]))
+    assert pairs() == [] and pairs(beyond=100.0) == [[0, 2], [1, 2]]

@@ -244,3 +244,17 @@ def test_depths_of_surfaces_in_sweeps_are_refused(device, count):
         ab.sweep(BALL, BOX, poses, output="distance", device=device, signed=True)
     for solid in ((True, False), (False, True)):
         assert len(ab.sweep(BALL, BOX, poses, output="distance", device=device, signed=True, solid=solid)) == count
+
+
+def test_depths_after_the_broad_phase_found_surfaces_alone(device):
+    scene, sheet = ab.Scene(device), ab.Model.from_arrays([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    scene.add(BOX, solid=True)
+    for model, x in ((BALL, 20), (sheet, 40), (sheet, 40.01)):
+        scene.add(model, (x, 0, 0, 0, 0, 0, 1))
+    apart = scene.intersect(None, "distance", signed=True)
+    assert apart.pairs.tolist() == [[2, 3]] and apart.distance[0] == 0
+    poses = np.tile((0.0, 0, 0, 0, 0, 0, 1), (4, 1))
+    poses[2:, 0] = 40
+    scene.set_poses(poses)
+    expected = ab.DistanceQuery(scene, [(0, 1)], signed=True).run().distance
+    assert scene.intersect([(0, 1)], "distance", signed=True).distance == expected < 0

@@ -49,7 +49,7 @@ class KeptQueries:
     def __init__(self, scene, find_pairs: Callable[[Any, float], np.ndarray]):
         self._scene, self._find_pairs = scene, find_pairs
         self.kept: dict[tuple, Query] = {}
-        self._finest: Batch | None = None
+        self._finest: tuple[Batch, BroadPhase] | None = None
 
     def clear(self):
         """Forget all queries."""
@@ -89,32 +89,34 @@ class KeptQueries:
         check_tolerances(**tolerances)
         beyond = options.get("beyond")
         reach = 0.0 if beyond is None else self._one_for_all(beyond, "beyond")
-        asked, key = self._scene, ("distance", signed, of_originals)
+        asked, given = self._scene, pairs
         if of_originals:
-            asked = self._find_finest()
+            asked, broad_phase = self._find_finest()
             # Originals may lie out of the boxes of their LODs.
-            pairs = BroadPhase(asked).find(reach) if pairs is None else pairs
-        elif key not in self.kept:
+            pairs = broad_phase.find(reach) if pairs is None else pairs
+        elif ("distance", signed, of_originals) not in self.kept:
             self._load(DistanceQuery, pairs is None, "any", "exact", False, False)
-        given, pairs = pairs, self._find_pairs(pairs, reach)
+        pairs = self._find_pairs(pairs, reach)
         if signed:
             batch = self._scene.batch()
             refuse_signed(signed, batch.has_solid(None if given is None else pairs))
             signed = batch.has_solid(pairs)  # the broad phase may have found surfaces alone
-        beyond = check_beyond(beyond, len(pairs))
+        key, beyond = ("distance", signed, of_originals), check_beyond(beyond, len(pairs))
         query = prepare_query(self.kept.pop(key, None), asked, pairs, beyond, tolerances, signed)
         return self._run(key, query, device)
 
-    def _find_finest(self) -> Batch:
-        """Return a batch of the objects at their finest LODs, as posed, whose tree states are made once."""
-        batch, finest = self._scene.batch(), self._finest
-        if finest is None:
+    def _find_finest(self) -> tuple[Batch, BroadPhase]:
+        """Return the objects at their finest LODs, as posed, with tree states that are made once; and their pairs."""
+        batch = self._scene.batch()
+        if self._finest is None:
             finest = batch.with_own_states(follows_poses=True)
             finest.add_finest(range(len(finest.models.lod_max)))
-            self._finest = finest
+            self._finest = finest, BroadPhase(finest)
+        finest, _ = self._finest
         if finest.excluded is not batch.excluded:
             finest.exclude(batch.excluded)
-        return finest
+            self._finest = finest, BroadPhase(finest)
+        return self._finest
 
     def find_first_contacts(self, pairs, end_poses, tolerance, screw, linear, device: bool) -> Result:
         """Answer `Scene.first_contact`; pairs are checked."""
