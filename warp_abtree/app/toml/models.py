@@ -24,7 +24,7 @@ def check_faces(path: Path, tables: dict):
         tables: `ModelTable`s by name.
 
     Raises:
-        SceneError: Shapes, and meshes that are brought to a number of faces, have more than FACE_LIMIT together.
+        SceneError: Shapes, and meshes that are brought to a number of faces, have more than SCENE_FACE_LIMIT together.
     """
     total = 0
     for name, table in tables.items():
