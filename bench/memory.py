@@ -20,9 +20,10 @@ def used_memory(device) -> dict:
 
 def memory_columns(scene, query=None) -> dict:
     """Return the columns of a scene's memory [MiB], and of a query's over it; the tree of the broad phase left out."""
-    total = sum(map(count_bytes, scene.batch().pools))
+    trees = scene.batch().trees
+    total = sum(map(count_bytes, (trees.models, trees.states, trees.objects)))
     if query is not None:
-        total += count_bytes(query) + count_bytes(query.hits)
+        total += count_bytes(query) + count_bytes(query.hits) + count_bytes(query.pair_batch)
         if query.broad_phase is not None:
             # Its pairs are the query's.
             total += count_bytes(query.broad_phase) - query.pairs.capacity - query.pair_count.capacity

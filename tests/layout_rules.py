@@ -237,15 +237,9 @@ def size_faults(tree, text):
             faults.append(f"{node.name}: {lines} lines")
         names = [argument.arg for argument in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
         taken = [name for name in names if name not in ("self", "cls")]
-        if len(taken) > ARGUMENTS and not grouped(node, text):
+        if len(taken) > ARGUMENTS:
             faults.append(f"{node.name}: {len(taken)} arguments")
     return faults
-
-
-def grouped(function, text):
-    """Return whether a signature marks the groups of its arguments, as kernels and their functions may."""
-    signature = text.splitlines()[function.lineno - 1 : function.body[0].lineno - 1]
-    return {"# static", "# state"} <= {line.strip() for line in signature}
 
 
 def struct_faults(tree, text):

@@ -71,6 +71,15 @@ class ObjectPool:
     position: wp.array(dtype=wp.vec3d)  # [world units], shape [object]
 
 
+@wp.struct
+class Trees:
+    """The AB-Trees that a kernel reads: models, their tree states, and the objects that stand at these."""
+
+    models: ModelPool  # static
+    states: StatePool  # one a model at a LOD
+    objects: ObjectPool  # posed
+
+
 @wp.func
 def pair_key(pair: wp.vec2i):
     """Return first object * 2^32 + second object, which sorts pairs by their objects."""

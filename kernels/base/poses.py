@@ -8,7 +8,7 @@ the margin; a column is longer than 1 by at most `skew`.
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ObjectPool, Trees
 from warp_abtree.kernels.base.nodes import load_node
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -57,6 +57,16 @@ class PairPose:
     floor: wp.vec2i  # nodes of A, and of B, from these on have slabs; none where either model has none
     faces_a: wp.int32  # about how many faces A has at its LOD, no more than at the finest
     faces_b: wp.int32  # the same of B
+
+
+@wp.struct
+class PairBatch:
+    """The object pairs of a launch."""
+
+    count: wp.array(dtype=wp.int32)  # of pairs, perhaps more than there is room for, shape [1]
+    pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]
+    poses: wp.array(dtype=PairPose)  # of B in A's frame, shape [pair]
+    launched: wp.array(dtype=wp.int32)  # what became of the launch, see `generation.LaunchRecord`, shape [2]
 
 
 @wp.func
@@ -118,56 +128,54 @@ def unit_scale(reach: wp.float64):
 
 
 @wp.func
-def has_node_slabs(models: ModelPool, states: StatePool, state: wp.int32):
+def has_node_slabs(trees: Trees, state: wp.int32):
     """Return whether there are slabs of a state's nodes: of original faces, and where they gain."""
-    model = states.model[state]
-    if models.node_slab.shape[0] == 0 or states.lod[state] < models.lod_max[model]:
+    model = trees.states.model[state]
+    if trees.models.node_slab.shape[0] == 0 or trees.states.lod[state] < trees.models.lod_max[model]:
         return False
-    gain = models.slab_gain[model]
+    gain = trees.models.slab_gain[model]
     return gain[0] > SLAB_GAIN_LEAST * gain[1]
 
 
 @wp.func
-def active_faces(models: ModelPool, states: StatePool, state: wp.int32):
+def active_faces(trees: Trees, state: wp.int32):
     """Estimate the number of faces of a state: a vertex split of a closed manifold adds two."""
-    model = states.model[state]
-    return models.face_count[model] - 2 * (models.lod_max[model] - states.lod[state])
+    model = trees.states.model[state]
+    return trees.models.face_count[model] - 2 * (trees.models.lod_max[model] - trees.states.lod[state])
 
 
 @wp.func
-def place_trees(models: ModelPool, states: StatePool, state_a: wp.int32, state_b: wp.int32):
+def place_trees(trees: Trees, state_a: wp.int32, state_b: wp.int32):
     """Return a `PairPose` with the places of the trees in the pool, and no more."""
     pose = PairPose()
-    pose.node_a = states.node_start[state_a]
-    pose.node_b = states.node_start[state_b]
-    pose.corner_a = states.face_start[state_a]
-    pose.corner_b = states.face_start[state_b]
-    pose.faces_a = active_faces(models, states, state_a)
-    pose.faces_b = active_faces(models, states, state_b)
-    model_a, model_b = states.model[state_a], states.model[state_b]
-    pose.slab = wp.vec2i(models.node_start[model_a], models.node_start[model_b])
+    pose.node_a = trees.states.node_start[state_a]
+    pose.node_b = trees.states.node_start[state_b]
+    pose.corner_a = trees.states.face_start[state_a]
+    pose.corner_b = trees.states.face_start[state_b]
+    pose.faces_a = active_faces(trees, state_a)
+    pose.faces_b = active_faces(trees, state_b)
+    model_a, model_b = trees.states.model[state_a], trees.states.model[state_b]
+    pose.slab = wp.vec2i(trees.models.node_start[model_a], trees.models.node_start[model_b])
     pose.floor = wp.vec2i(NO_NODE, NO_NODE)
-    if has_node_slabs(models, states, state_a) and has_node_slabs(models, states, state_b):
-        pose.floor[0] = 1 << wp.max(models.depth[model_a] - SLAB_DEPTH, 0)
-        pose.floor[1] = 1 << wp.max(models.depth[model_b] - SLAB_DEPTH, 0)
+    if has_node_slabs(trees, state_a) and has_node_slabs(trees, state_b):
+        pose.floor[0] = 1 << wp.max(trees.models.depth[model_a] - SLAB_DEPTH, 0)
+        pose.floor[1] = 1 << wp.max(trees.models.depth[model_b] - SLAB_DEPTH, 0)
     return pose
 
 
 @wp.func
-def pair_pose(
-    whole: bool, models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32, within: wp.float64
-):
+def pair_pose(whole: bool, trees: Trees, a: wp.int32, b: wp.int32, within: wp.float64):
     """Return the `PairPose` of B in A's frame, for points that meet or lie within a distance in A's frame.
 
     `whole` says that all faces are asked for, not one hit, which float32 may find first.
     """
-    r, t = relative_pose(objects, a, b)
-    state_a = objects.state[a]
-    state_b = objects.state[b]
-    centre_a = models.centre[states.model[state_a]]
-    centre_b = models.centre[states.model[state_b]]
-    root_a = load_node(states, states.node_start[state_a] + 1)
-    root_b = load_node(states, states.node_start[state_b] + 1)
+    r, t = relative_pose(trees.objects, a, b)
+    state_a = trees.objects.state[a]
+    state_b = trees.objects.state[b]
+    centre_a = trees.models.centre[trees.states.model[state_a]]
+    centre_b = trees.models.centre[trees.states.model[state_b]]
+    root_a = load_node(trees.states, trees.states.node_start[state_a] + 1)
+    root_b = load_node(trees.states, trees.states.node_start[state_b] + 1)
     reach_a = reach_box(root_a.lower, root_a.upper)
     reach_b = reach_box(root_b.lower, root_b.upper)
     shift = wp.vec3d()
@@ -185,7 +193,7 @@ def pair_pose(
     # Of a coordinate in `float32_filter_triangles`; docs/exactness.md has the terms, which need `near` below.
     off32 = UNIT_32 * (wp.float64(2.0) * reach_a + wp.float64(13.0) * reach_b + wp.float64(3.0) * far)
 
-    pose = place_trees(models, states, state_a, state_b)
+    pose = place_trees(trees, state_a, state_b)
     pose.rotation = r
     pose.translation = t
     pose.within = within
@@ -194,7 +202,8 @@ def pair_pose(
     pose.error = wp.float32(pose.scale * wp.float64(2.02) * (off32 + margin64))
     if wp.max(reach_a, reach_b) < REACH_MIN or wp.max(reach_a, reach_b) > REACH_MAX:
         pose.error = wp.inf
-    same = states.model[state_a] == states.model[state_b] and states.lod[state_a] == states.lod[state_b]
+    same = trees.states.model[state_a] == trees.states.model[state_b]
+    same = same and trees.states.lod[state_a] == trees.states.lod[state_b]
     if whole and same and far + wp.float64(3.0) * rotation_size * reach_b <= off32:
         # Coincident meshes: no vertex is farther from its twin than float32 can tell.
         pose.error = wp.inf

@@ -6,7 +6,8 @@ nearest are what they meet with. So the gap of such an object pair is cut to its
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, Bodies
 from warp_abtree.kernels.distance.report import Distances
 
@@ -28,59 +29,46 @@ class Chosen:
 
 
 @wp.func
-def half_face_size(models: ModelPool, states: StatePool, state: wp.int32, radius: wp.float64):
+def half_face_size(trees: Trees, state: wp.int32, radius: wp.float64):
     """Estimate half the width of a body's faces at its LOD, as if it were a ball [world units]."""
-    model = states.model[state]
-    faces = models.face_count[model] - 2 * (models.lod_max[model] - states.lod[state])
+    model = trees.states.model[state]
+    faces = trees.models.face_count[model] - 2 * (trees.models.lod_max[model] - trees.states.lod[state])
     return HALF_ROOT * radius / wp.sqrt(wp.float64(wp.max(faces, FACES_LEAST)))
 
 
 @wp.func
-def band_of(models: ModelPool, states: StatePool, objects: ObjectPool, bodies: Bodies, a: wp.int32, b: wp.int32):
+def band_of(trees: Trees, bodies: Bodies, a: wp.int32, b: wp.int32):
     """Return how far beyond their distance contacts of two objects are looked for: half a face's size [world units]."""
     band = wp.float64(wp.inf)
     if bodies.motion_type[a] == DYNAMIC:
-        band = half_face_size(models, states, objects.state[a], bodies.bounding_radius[a])
+        band = half_face_size(trees, trees.objects.state[a], bodies.bounding_radius[a])
     if bodies.motion_type[b] == DYNAMIC:
-        band = wp.min(band, half_face_size(models, states, objects.state[b], bodies.bounding_radius[b]))
+        band = wp.min(band, half_face_size(trees, trees.objects.state[b], bodies.bounding_radius[b]))
     return band
 
 
 @wp.kernel
 def choose_fast_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    gap: wp.array(dtype=wp.float64),
-    bodies: Bodies,
-    chosen_inout: Chosen,
+    trees: Trees, batch: PairBatch, gap: wp.array(dtype=wp.float64), bodies: Bodies, chosen_inout: Chosen
 ):
     """Choose the pair of a thread if its gap is wide, to find its distance as far as that."""
     p = wp.tid()
-    if p >= wp.min(pair_count[0], pairs.shape[0]):
+    if p >= wp.min(batch.count[0], batch.pairs.shape[0]):
         return
-    if gap[p] > band_of(models, states, objects, bodies, pairs[p][0], pairs[p][1]):
+    if gap[p] > band_of(trees, bodies, batch.pairs[p][0], batch.pairs[p][1]):
         slot = wp.atomic_add(chosen_inout.count, 0, 1)
-        chosen_inout.pairs[slot] = pairs[p]
+        chosen_inout.pairs[slot] = batch.pairs[p]
         chosen_inout.place[slot] = p
         chosen_inout.beyond[slot] = gap[p]
 
 
 @wp.kernel
 def cut_gap_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    chosen: Chosen,
-    distances: Distances,
-    bodies: Bodies,
-    gap_inout: wp.array(dtype=wp.float64),
+    trees: Trees, chosen: Chosen, distances: Distances, bodies: Bodies, gap_inout: wp.array(dtype=wp.float64)
 ):
     """Cut the gap of a chosen pair a thread to its distance and half a face's size; to 0 where that is over the gap."""
     i = wp.tid()
     if i < chosen.count[0]:
         upper = distances.bracket[i][1]
-        band = band_of(models, states, objects, bodies, chosen.pairs[i][0], chosen.pairs[i][1])
+        band = band_of(trees, bodies, chosen.pairs[i][0], chosen.pairs[i][1])
         gap_inout[chosen.place[i]] = wp.where(upper < wp.inf, wp.min(chosen.beyond[i], upper + band), wp.float64(0.0))

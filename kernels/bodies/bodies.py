@@ -6,7 +6,7 @@ A body frame has its origin at the centre of mass and its axes along the princip
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import ObjectPool
-from warp_abtree.kernels.base.poses import HALF
+from warp_abtree.kernels.base.poses import HALF, PairBatch
 from warp_abtree.kernels.intersect.face_pairs import Hits
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -24,7 +24,6 @@ LOOKAHEAD_LEAST, LOOKAHEAD_MAX = wp.constant(wp.float64(2.0**-8)), wp.constant(w
 class Bodies:
     """Bodies, one entry an object. Those that are not DYNAMIC have infinite mass: inverses are 0."""
 
-    # static
     motion_type: wp.array(dtype=wp.int32)  # STATIC, KINEMATIC or DYNAMIC
     rank: wp.array(dtype=wp.int32)  # rank among the rigid bodies of the same world
     inverse_mass: wp.array(dtype=wp.float64)  # [1 / mass]
@@ -32,7 +31,6 @@ class Bodies:
     centre: wp.array(dtype=wp.vec3d)  # centre of mass, model frame [world units]
     axes: wp.array(dtype=wp.mat33d)  # principal axes as columns, model frame
     bounding_radius: wp.array(dtype=wp.float64)  # about the centre of mass [world units]
-    # state
     position: wp.array(dtype=wp.vec3d)  # of the body frame [world units]
     rotation: wp.array(dtype=wp.quatd)  # of the body frame, x y z w
     velocity: wp.array(dtype=wp.vec3d)  # of the centre of mass [world units/s]
@@ -73,16 +71,9 @@ def integrate_rotation(q: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d
 
 
 @wp.kernel
-def judge_contacts_kernel(
-    launched: wp.array(dtype=wp.int32),
-    pair_count: wp.array(dtype=wp.int32),
-    pair_room: wp.int32,
-    hits: Hits,
-    # out
-    bodies_out: Bodies,
-):
+def judge_contacts_kernel(batch: PairBatch, hits: Hits, bodies_out: Bodies):
     """Note whether a query found all contacts within its capacity; one thread."""
-    whole = launched[0] >= 0 and wp.uint32(pair_count[0]) <= wp.uint32(pair_room)
+    whole = batch.launched[0] >= 0 and wp.uint32(batch.count[0]) <= wp.uint32(batch.pairs.shape[0])
     whole = whole and wp.uint32(hits.total[0]) <= wp.uint32(hits.face.shape[0])
     if hits.uncertain.shape[0] > 0:
         whole = whole and wp.uint32(hits.uncertain_total[0]) <= wp.uint32(hits.uncertain.shape[0])
@@ -97,7 +88,6 @@ def begin_step_kernel(
     velocity_change: wp.vec3d,
     targets: ObjectPool,
     objects: ObjectPool,
-    # state
     bodies_inout: Bodies,
 ):
     """Initialise a step: gravity changes velocities; kinematic objects get those that take them to their targets."""
@@ -138,7 +128,6 @@ def reach_of(bodies: Bodies, i: wp.int32, dt: wp.float64):
 def integrate_kernel(
     dt: wp.float64,
     targets: ObjectPool,
-    # state
     bodies_inout: Bodies,
     objects_inout: ObjectPool,
 ):

@@ -3,6 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import ObjectPool, pair_key
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, Bodies
 from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT, INACTIVE
 from warp_abtree.kernels.contacts.manifold import Manifolds
@@ -127,17 +128,14 @@ def find_match(warm_start: WarmStart, row: wp.int32, radius: wp.float64, point: 
 
 @wp.kernel
 def prepare_constraints_kernel(
-    # static
     dt: wp.float64,
     fast: wp.float64,
     shell: wp.float64,
-    # state
-    pairs: wp.array(dtype=wp.vec2i),
+    batch: PairBatch,
     objects: ObjectPool,
     manifolds: Manifolds,
     warm_start: WarmStart,
     bodies: Bodies,
-    # out
     order_out: wp.array(dtype=wp.int32),
     constraints_out: Constraints,
 ):
@@ -151,19 +149,19 @@ def prepare_constraints_kernel(
     constraints_out.color[p] = INACTIVE
     if manifolds.count[p] == 0:
         return
-    a = pairs[p][0]
-    b = pairs[p][1]
+    a = batch.pairs[p][0]
+    b = batch.pairs[p][1]
     if bodies.motion_type[a] != DYNAMIC and bodies.motion_type[b] != DYNAMIC:
         return
     constraints_out.color[p] = COLOR_COUNT
     radius = wp.min(bodies.bounding_radius[a], bodies.bounding_radius[b])
-    key = pair_key(pairs[p])
+    key = pair_key(batch.pairs[p])
     row = wp.min(wp.lower_bound(warm_start.key, key), warm_start.key.shape[0] - 1)
     known = warm_start.key[row] == key
     used = wp.int32(0)
     for k in range(manifolds.count[p]):
         x = manifolds.point[p, k]
-        c = make_point(manifolds, pairs[p], p, k)
+        c = make_point(manifolds, batch.pairs[p], p, k)
         constraints_out.arm_a[p, k] = x - bodies.position[a]
         constraints_out.arm_b[p, k] = x - bodies.position[b]
         set_effective_mass(bodies, constraints_out, c)
@@ -188,16 +186,13 @@ def prepare_constraints_kernel(
 
 @wp.kernel
 def save_impulses_kernel(
-    # static
     fast: wp.float64,
-    # state
     key: wp.array(dtype=wp.int64),
-    pairs: wp.array(dtype=wp.vec2i),
+    batch: PairBatch,
     objects: ObjectPool,
     manifolds: Manifolds,
     constraints: Constraints,
     bodies: Bodies,
-    # out
     warm_start_out: WarmStart,
 ):
     """Save the impulses of one pair a thread for the next step, with points relative to the first object.
@@ -209,7 +204,7 @@ def save_impulses_kernel(
         return
     warm_start_out.key[p] = key[p]
     warm_start_out.count[p] = manifolds.count[p]
-    a = pairs[p][0]
+    a = batch.pairs[p][0]
     for k in range(manifolds.count[p]):
         local = wp.transpose(objects.rotation[a]) * (manifolds.point[p, k] - objects.position[a])
         warm_start_out.point[p, k] = local

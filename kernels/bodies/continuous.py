@@ -12,6 +12,7 @@ leads from each object's pose to its new one, on which no two surfaces meet that
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import ObjectPool
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, STATIC, Bodies, rotation_by
 from warp_abtree.kernels.bodies.constraints import SLOP
 from warp_abtree.kernels.intersect.face_pairs import Hits
@@ -42,9 +43,7 @@ ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 class StepMotions:
     """Motions of objects in a step."""
 
-    # static
     world: wp.array(dtype=wp.int32)  # number of the world that is held together, shape [object]
-    # state
     goals: ObjectPool  # poses that the step aims for: rotation and position
     ends: ObjectPool  # poses that it ends at
     fraction: wp.array(dtype=wp.float64)  # of its motion that an object makes, 0 to 1, shape [object]
@@ -96,18 +95,12 @@ def begin_way_kernel(objects: ObjectPool, bodies: Bodies, motions_inout: StepMot
 
 
 @wp.kernel
-def exempt_pair_kernel(
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    hits: Hits,
-    bodies: Bodies,
-    motions_inout: StepMotions,
-):
+def exempt_pair_kernel(batch: PairBatch, hits: Hits, bodies: Bodies, motions_inout: StepMotions):
     """Exempt a pair a thread whose surfaces intersect at first, or neither of which is a rigid body."""
     p = wp.tid()
-    if p >= pair_count[0]:
+    if p >= batch.count[0]:
         return
-    moves = bodies.motion_type[pairs[p][0]] == DYNAMIC or bodies.motion_type[pairs[p][1]] == DYNAMIC
+    moves = bodies.motion_type[batch.pairs[p][0]] == DYNAMIC or bodies.motion_type[batch.pairs[p][1]] == DYNAMIC
     touches = hits.any_hit[p] != 0
     motions_inout.level[p] = wp.where(touches or not moves, EXEMPT, 0)
     motions_inout.is_again[p] = 0
@@ -116,14 +109,12 @@ def exempt_pair_kernel(
 
 
 @wp.kernel
-def choose_pair_kernel(
-    pair_count: wp.array(dtype=wp.int32), pairs: wp.array(dtype=wp.vec2i), motions: StepMotions, hits_inout: Hits
-):
+def choose_pair_kernel(batch: PairBatch, motions: StepMotions, hits_inout: Hits):
     """Choose a pair a thread for the next round: the search leaves out those that are marked as intersecting."""
     p = wp.tid()
-    if p >= pair_count[0]:
+    if p >= batch.count[0]:
         return
-    a, b = pairs[p][0], pairs[p][1]
+    a, b = batch.pairs[p][0], batch.pairs[p][1]
     changed = (
         motions.is_changed[a] + motions.is_changed[b] + motions.is_again[p] > 0
         and motions.fraction[a] + motions.fraction[b] > ZERO
@@ -138,8 +129,7 @@ def slop_of(bodies: Bodies, pair: wp.vec2i):
 
 @wp.kernel
 def widen_motion_kernel(
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
+    batch: PairBatch,
     contacts: FirstContacts,
     bodies: Bodies,
     motions: StepMotions,
@@ -147,9 +137,9 @@ def widen_motion_kernel(
 ):
     """Thicken the surfaces of a pair a thread where they are near: by a quarter of a slop, or 1/32 of that."""
     p = wp.tid()
-    if p >= pair_count[0] or contacts.end[p] != OPEN or motions.level[p] >= LAST_LEVEL:
+    if p >= batch.count[0] or contacts.end[p] != OPEN or motions.level[p] >= LAST_LEVEL:
         return
-    margin = slop_of(bodies, pairs[p]) * wp.where(motions.level[p] == 0, NEAR, NEAR * VERY_NEAR)
+    margin = slop_of(bodies, batch.pairs[p]) * wp.where(motions.level[p] == 0, NEAR, NEAR * VERY_NEAR)
     motion = motion_inout[p]
     motion.slack = motion.slack + margin
     motion.margin = motion.margin + wp.float32(margin * motion.scale)
@@ -169,8 +159,7 @@ def way_length(objects: ObjectPool, motions: StepMotions, bodies: Bodies, i: wp.
 @wp.kernel
 def cut_way_kernel(
     mode: wp.int32,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
+    batch: PairBatch,
     objects: ObjectPool,
     hits: Hits,
     contacts: FirstContacts,
@@ -179,12 +168,12 @@ def cut_way_kernel(
 ):
     """Cut the ways of both objects of a pair a thread that is not proved clear, or hold their worlds."""
     p = wp.tid()
-    if p >= pair_count[0] or hits.any_hit[p] != 0:
+    if p >= batch.count[0] or hits.any_hit[p] != 0:
         return
     motions_inout.is_again[p] = 0
     if contacts.end[p] == CLEAR:
         return
-    a, b = pairs[p][0], pairs[p][1]
+    a, b = batch.pairs[p][0], batch.pairs[p][1]
     if mode <= MATCH and contacts.time[p] == ZERO and motions_inout.level[p] < LAST_LEVEL:
         motions_inout.level[p] += 1
         motions_inout.is_again[p] = 1
@@ -194,8 +183,8 @@ def cut_way_kernel(
     if mode == CERTIFY:
         wp.atomic_add(motions_inout.counter, HELD_PAIRS, 1)
         for k in range(2):
-            if bodies.motion_type[pairs[p][k]] != STATIC:
-                wp.atomic_max(motions_inout.is_held, motions_inout.world[pairs[p][k]], 1)
+            if bodies.motion_type[batch.pairs[p][k]] != STATIC:
+                wp.atomic_max(motions_inout.is_held, motions_inout.world[batch.pairs[p][k]], 1)
         return
     if mode == HOLD_BOTH:
         wp.atomic_min(motions_inout.cut, a, ZERO)
@@ -203,7 +192,7 @@ def cut_way_kernel(
         return
     # A quarter of a slop before the contact, where contacts ahead find it.
     length = way_length(objects, motions_inout, bodies, a) + way_length(objects, motions_inout, bodies, b)
-    back = NEAR * slop_of(bodies, pairs[p])
+    back = NEAR * slop_of(bodies, batch.pairs[p])
     fraction = wp.max(contacts.time[p] - back / wp.max(length, back), ZERO)
     fraction_a, fraction_b = motions_inout.fraction[a], motions_inout.fraction[b]
     less, more = wp.min(fraction_a, fraction_b), wp.max(fraction_a, fraction_b)
@@ -253,8 +242,7 @@ def spin_energy(rotation: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d
 @wp.kernel
 def end_way_kernel(
     velocity_change: wp.vec3d,
-    launched: wp.array(dtype=wp.int32),
-    pair_count: wp.array(dtype=wp.int32),
+    batch: PairBatch,
     hits: Hits,
     motions: StepMotions,
     bodies_inout: Bodies,
@@ -269,7 +257,7 @@ def end_way_kernel(
     i = wp.tid()
     if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] == STATIC:
         return
-    whole = launched[0] >= 0 and wp.uint32(pair_count[0]) <= wp.uint32(motions.level.shape[0])
+    whole = batch.launched[0] >= 0 and wp.uint32(batch.count[0]) <= wp.uint32(motions.level.shape[0])
     if hits.uncertain.shape[0] > 0:
         whole = whole and wp.uint32(hits.uncertain_total[0]) <= wp.uint32(hits.uncertain.shape[0])
     if not whole:

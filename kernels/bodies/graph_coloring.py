@@ -7,6 +7,7 @@ Source: Luby 1986; Jones and Plassmann 1993.
 
 import warp as wp
 
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, Bodies
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -44,11 +45,7 @@ def held_bid(color: wp.int32, rounds: wp.int32):
 
 @wp.kernel
 def bid_kernel(
-    turn: wp.int32,
-    rounds: wp.int32,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_color: wp.array(dtype=wp.int32),
-    bodies_inout: Bodies,
+    turn: wp.int32, rounds: wp.int32, batch: PairBatch, pair_color: wp.array(dtype=wp.int32), bodies_inout: Bodies
 ):
     """Bid for both bodies of each uncolored pair in a round, unless another pair of its color holds one.
 
@@ -59,21 +56,17 @@ def bid_kernel(
     if pair_color[p] != COLOR_COUNT:
         return
     for k in range(2):
-        if bodies_inout.bid[pairs[p][k]] >= held_bid(turn / rounds, rounds):
+        if bodies_inout.bid[batch.pairs[p][k]] >= held_bid(turn / rounds, rounds):
             return
     for k in range(2):
-        i = pairs[p][k]
+        i = batch.pairs[p][k]
         if bodies_inout.motion_type[i] == DYNAMIC:
-            wp.atomic_max(bodies_inout.bid, i, make_bid(p, turn, pairs[p], bodies_inout))
+            wp.atomic_max(bodies_inout.bid, i, make_bid(p, turn, batch.pairs[p], bodies_inout))
 
 
 @wp.kernel
 def assign_color_kernel(
-    turn: wp.int32,
-    rounds: wp.int32,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_color_inout: wp.array(dtype=wp.int32),
-    bodies_inout: Bodies,
+    turn: wp.int32, rounds: wp.int32, batch: PairBatch, pair_color_inout: wp.array(dtype=wp.int32), bodies_inout: Bodies
 ):
     """Give the color of a round to the pairs that won both bodies, which they hold while rounds have this color.
 
@@ -83,14 +76,14 @@ def assign_color_kernel(
     p = wp.tid()
     if pair_color_inout[p] != COLOR_COUNT:
         return
-    bid = make_bid(p, turn, pairs[p], bodies_inout)
+    bid = make_bid(p, turn, batch.pairs[p], bodies_inout)
     for k in range(2):
-        i = pairs[p][k]
+        i = batch.pairs[p][k]
         if bodies_inout.motion_type[i] == DYNAMIC and bodies_inout.bid[i] != bid:
             return
     color = turn / rounds
     pair_color_inout[p] = color
     for k in range(2):
         # No other pair has won it; what does not move is never won.
-        if bodies_inout.motion_type[pairs[p][k]] == DYNAMIC:
-            bodies_inout.bid[pairs[p][k]] = held_bid(color, rounds)
+        if bodies_inout.motion_type[batch.pairs[p][k]] == DYNAMIC:
+            bodies_inout.bid[batch.pairs[p][k]] = held_bid(color, rounds)

@@ -6,6 +6,7 @@ Pairs of one color share no dynamic body, so one thread for all of them and a th
 import warp as wp
 
 from warp_abtree.kernels.base.lanes import block_sync
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, Bodies
 from warp_abtree.kernels.bodies.constraints import Constraints, point_velocity
 from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT
@@ -265,12 +266,10 @@ def relax_positions(
 
 @wp.kernel
 def relax_kernel(
-    # static
     relaxation: Relaxation,
     order: wp.array(dtype=wp.int32),
     color: wp.array(dtype=wp.int32),
-    # state
-    pairs: wp.array(dtype=wp.vec2i),
+    batch: PairBatch,
     manifolds: Manifolds,
     constraints_inout: Constraints,
     bodies_inout: Bodies,
@@ -298,10 +297,12 @@ def relax_kernel(
             for turn in range(wp.tid(), end - start, threads):
                 p = order[wp.where(backward != 0, end - 1 - turn, start + turn)]
                 if stage == WARM_START:
-                    apply_warm_start(p, pairs[p], manifolds, constraints_inout, bodies_inout)
+                    apply_warm_start(p, batch.pairs[p], manifolds, constraints_inout, bodies_inout)
                 elif stage == VELOCITY:
-                    relax_velocities(relaxation, p, pairs[p], backward, manifolds, constraints_inout, bodies_inout)
+                    relax_velocities(
+                        relaxation, p, batch.pairs[p], backward, manifolds, constraints_inout, bodies_inout
+                    )
                 else:
-                    relax_positions(relaxation, p, pairs[p], manifolds, constraints_inout, bodies_inout)
+                    relax_positions(relaxation, p, batch.pairs[p], manifolds, constraints_inout, bodies_inout)
         if colors > 1:
             block_sync()

@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.base.arrays import Trees, load_vertex
 from warp_abtree.kernels.base.lanes import warp_lane, warp_size
-from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.base.poses import PairBatch, pose_point
 from warp_abtree.kernels.exact.expansion import EXPANSION_LANES
 from warp_abtree.kernels.intersect.uncertain_pairs import items_at_once
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_corners
@@ -31,12 +31,12 @@ class Contacts:
 
 
 @wp.func
-def pair_direction(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32):
+def pair_direction(trees: Trees, a: wp.int32, b: wp.int32):
     """Return the unit vector between the centres of two models, world frame; x where they coincide."""
-    centre_a = models.centre[states.model[objects.state[a]]]
-    centre_b = models.centre[states.model[objects.state[b]]]
-    from_a = pose_point(objects.rotation[a], objects.position[a], centre_a)
-    v = unit_vector(pose_point(objects.rotation[b], objects.position[b], centre_b) - from_a)
+    centre_a = trees.models.centre[trees.states.model[trees.objects.state[a]]]
+    centre_b = trees.models.centre[trees.states.model[trees.objects.state[b]]]
+    from_a = pose_point(trees.objects.rotation[a], trees.objects.position[a], centre_a)
+    v = unit_vector(pose_point(trees.objects.rotation[b], trees.objects.position[b], centre_b) - from_a)
     if wp.dot(v, v) == wp.float64(0.0):
         return wp.vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
     return v
@@ -60,11 +60,11 @@ class Deferred:
 
 
 @wp.func
-def contact_objects(pairs: wp.array(dtype=wp.vec2i), pair_poses: wp.array(dtype=PairPose), p: wp.int32):
+def contact_objects(batch: PairBatch, p: wp.int32):
     own = PairObjects()
-    own.a = wp.min(pairs[p][0], pairs[p][1])
-    own.b = wp.max(pairs[p][0], pairs[p][1])
-    own.swapped = pair_poses[p].swapped
+    own.a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
+    own.b = wp.max(batch.pairs[p][0], batch.pairs[p][1])
+    own.swapped = batch.poses[p].swapped
     return own
 
 
@@ -87,29 +87,24 @@ def blend_normals(normal_a: wp.vec3d, normal_b: wp.vec3d):
 
 @wp.func
 def write_contact(
-    # static
-    models: ModelPool,
-    # state
-    states: StatePool,
-    objects: ObjectPool,
+    trees: Trees,
     own: PairObjects,
     i: wp.int32,
     p0: wp.vec3d,
     p1: wp.vec3d,
     face_normal_a: wp.vec3d,
     face_normal_b: wp.vec3d,
-    # out
     contacts: Contacts,
 ):
     """Pose a contact to the world, from points and normals in the frame of object a."""
-    rotation = objects.rotation[own.a]
-    end0 = pose_point(rotation, objects.position[own.a], p0)
-    end1 = pose_point(rotation, objects.position[own.a], p1)
+    rotation = trees.objects.rotation[own.a]
+    end0 = pose_point(rotation, trees.objects.position[own.a], p0)
+    end1 = pose_point(rotation, trees.objects.position[own.a], p1)
     normal_a = unit_vector(rotation * face_normal_a)
     normal_b = unit_vector(rotation * face_normal_b)
     normal = blend_normals(normal_a, normal_b)
     if wp.dot(normal, normal) == wp.float64(0.0):
-        normal = pair_direction(models, states, objects, own.a, own.b)
+        normal = pair_direction(trees, own.a, own.b)
     back = own.swapped != 0
     contacts.p0[i] = wp.where(back, end1, end0)
     contacts.p1[i] = wp.where(back, end0, end1)
@@ -120,11 +115,8 @@ def write_contact(
 
 @wp.kernel(cuda_max_registers=128)
 def find_contact_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     proven: bool,
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
@@ -141,22 +133,22 @@ def find_contact_kernel(
     if i >= start[start.shape[0] - 1] or not have_crossed(contacts_out, i):
         return
     p = faces[i][0]
-    own = contact_objects(pairs, pair_poses, p)
-    a = load_corner_ids(states, pair_poses[p].corner_a + faces[i][1 + own.swapped])
-    b = load_corner_ids(states, pair_poses[p].corner_b + faces[i][2 - own.swapped])
-    rotation = pair_poses[p].rotation
-    shift = pair_poses[p].translation
-    a0 = load_vertex(models.vertex_pos, a[0])
-    a1 = load_vertex(models.vertex_pos, a[1])
-    a2 = load_vertex(models.vertex_pos, a[2])
-    b0 = pose_point(rotation, shift, load_vertex(models.vertex_pos, b[0]))
-    b1 = pose_point(rotation, shift, load_vertex(models.vertex_pos, b[1]))
-    b2 = pose_point(rotation, shift, load_vertex(models.vertex_pos, b[2]))
+    own = contact_objects(batch, p)
+    a = load_corner_ids(trees.states, batch.poses[p].corner_a + faces[i][1 + own.swapped])
+    b = load_corner_ids(trees.states, batch.poses[p].corner_b + faces[i][2 - own.swapped])
+    rotation = batch.poses[p].rotation
+    shift = batch.poses[p].translation
+    a0 = load_vertex(trees.models.vertex_pos, a[0])
+    a1 = load_vertex(trees.models.vertex_pos, a[1])
+    a2 = load_vertex(trees.models.vertex_pos, a[2])
+    b0 = pose_point(rotation, shift, load_vertex(trees.models.vertex_pos, b[0]))
+    b1 = pose_point(rotation, shift, load_vertex(trees.models.vertex_pos, b[1]))
+    b2 = pose_point(rotation, shift, load_vertex(trees.models.vertex_pos, b[2]))
     normal_a, sure_a = filter_normal(a0, a1, a2)
     normal_b, sure_b = filter_normal(b0, b1, b2)
     p0, p1, sure = filter_segment(proven, a0, a1, a2, b0, b1, b2)
     if sure and sure_a and sure_b:
-        write_contact(models, states, objects, own, i, p0, p1, normal_a, normal_b, contacts_out)
+        write_contact(trees, own, i, p0, p1, normal_a, normal_b, contacts_out)
         contacts_out.coplanar[i] = 0
     else:
         deferred_inout.place[wp.atomic_add(deferred_inout.total, 0, 1)] = i
@@ -165,11 +157,8 @@ def find_contact_kernel(
 @wp.kernel
 def find_deferred_kernel(
     step: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     faces: wp.array(dtype=wp.vec3i),
     deferred: Deferred,
     contacts_out: Contacts,
@@ -180,13 +169,13 @@ def find_deferred_kernel(
     while warp_lane() < at_once and k < deferred.total[0]:
         i = deferred.place[k]
         p = faces[i][0]
-        own = contact_objects(pairs, pair_poses, p)
+        own = contact_objects(batch, p)
         corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
         face_a, face_b = faces[i][1 + own.swapped], faces[i][2 - own.swapped]
-        load_corners(models, states, pair_poses[p], face_a, face_b, corner)
-        p0, p1, coplanar = intersect_faces(pair_poses[p].scale, corner)
+        load_corners(trees, batch.poses[p], face_a, face_b, corner)
+        p0, p1, coplanar = intersect_faces(batch.poses[p].scale, corner)
         normal_a = face_normal(corner[0], corner[1], corner[2])
         normal_b = face_normal(corner[3], corner[4], corner[5])
-        write_contact(models, states, objects, own, i, p0, p1, normal_a, normal_b, contacts_out)
+        write_contact(trees, own, i, p0, p1, normal_a, normal_b, contacts_out)
         contacts_out.coplanar[i] = coplanar
         k += at_once * (step / warp_size())

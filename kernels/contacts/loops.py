@@ -7,8 +7,9 @@ nearer than a gap, are of no loop.
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import LAST_KEY, ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import LAST_KEY, Trees
 from warp_abtree.kernels.base.lanes import add_in_order, count_lanes, first_lane, six_numbers, warp_lane, warp_size
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.contacts.contact import Contacts, have_crossed, pair_direction
 from warp_abtree.kernels.contacts.manifold import Curves
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
@@ -200,10 +201,8 @@ def sum_loop(
 
 @wp.kernel
 def average_loop_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
+    trees: Trees,
+    batch: PairBatch,
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     contacts: Contacts,
@@ -235,7 +234,7 @@ def average_loop_kernel(
                 n = sums.plain
             if measure_length(sums.plain) <= LEAST_LOOP_AREA:
                 p = faces[order[first]][0]
-                n = pair_direction(models, states, objects, pairs[p][0], pairs[p][1])
+                n = pair_direction(trees, batch.pairs[p][0], batch.pairs[p][1])
         begins = begins and warp_lane() != lane
         if warp_lane() == 0:
             curves_inout.loop_normal[order[first]] = unit_vector(n)

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.base.arrays import Trees
+from warp_abtree.kernels.base.poses import PairBatch, pose_point
 from warp_abtree.kernels.contacts.contact import Contacts, have_crossed
 from warp_abtree.kernels.triangle.corners import load_corners
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
@@ -180,11 +180,8 @@ def write_candidates(
 
 @wp.kernel
 def find_candidate_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     gap: wp.array(dtype=wp.float64),
     rows: Rows,
     contacts: Contacts,
@@ -206,11 +203,11 @@ def find_candidate_kernel(
     if not have_crossed(contacts, i):
         return
     p = rows.faces[i][0]
-    swapped = pair_poses[p].swapped
-    a = wp.min(pairs[p][0], pairs[p][1])
+    swapped = batch.poses[p].swapped
+    a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    load_corners(models, states, pair_poses[p], rows.faces[i][1 + swapped], rows.faces[i][2 - swapped], corner)
-    rotation, position = objects.rotation[a], objects.position[a]
+    load_corners(trees, batch.poses[p], rows.faces[i][1 + swapped], rows.faces[i][2 - swapped], corner)
+    rotation, position = trees.objects.rotation[a], trees.objects.position[a]
     back = wp.transpose(rotation)
     normal_a = back * contacts.normal_a[i]
     normal_b = back * contacts.normal_b[i]

@@ -7,10 +7,10 @@ inside, or beyond a thin wall. In either case points count only where no other f
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.base.arrays import ObjectPool, Trees, load_vertex
 from warp_abtree.kernels.base.counters import reserve_slot
 from warp_abtree.kernels.base.lanes import rank_flag, warp_any, warp_size
-from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.contacts.contact import Contacts, Deferred, have_crossed
 from warp_abtree.kernels.contacts.loops import contact_key
 from warp_abtree.kernels.contacts.manifold import NO_DEPTH, NO_POINT, Curves, Rows, measure_column, write_candidates
@@ -53,13 +53,13 @@ def make_row(pose: PairPose, back: wp.mat33d, position: wp.vec3d, p0: wp.vec3d, 
 
 
 @wp.func
-def is_nearer(models: ModelPool, states: StatePool, pose: PairPose, row: NearRow, face: wp.int32, of_first: bool):
+def is_nearer(trees: Trees, pose: PairPose, row: NearRow, face: wp.int32, of_first: bool):
     """Return whether another face of the first object is nearer to `second`, or one of the second's to `first`."""
     point = wp.where(of_first, row.second, row.first)
     of_b = of_first == (row.swapped != 0)
-    ids = load_corner_ids(states, wp.where(of_b, pose.corner_b, pose.corner_a) + face)
-    a, b = load_vertex(models.vertex_pos, ids[0]), load_vertex(models.vertex_pos, ids[1])
-    c = load_vertex(models.vertex_pos, ids[2])
+    ids = load_corner_ids(trees.states, wp.where(of_b, pose.corner_b, pose.corner_a) + face)
+    a, b = load_vertex(trees.models.vertex_pos, ids[0]), load_vertex(trees.models.vertex_pos, ids[1])
+    c = load_vertex(trees.models.vertex_pos, ids[2])
     if of_b:
         a = pose_point(pose.rotation, pose.translation, a)
         b = pose_point(pose.rotation, pose.translation, b)
@@ -104,16 +104,7 @@ def is_nearest_only(contacts: Contacts, curves: Curves, i: wp.int32, end: wp.int
 
 
 @wp.kernel
-def keep_nearest_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    rows: Rows,
-    contacts: Contacts,
-    curves_inout: Curves,
-):
+def keep_nearest_kernel(trees: Trees, batch: PairBatch, rows: Rows, contacts: Contacts, curves_inout: Curves):
     """Drop the candidates of contacts of which a neighbour has a face nearer to their points than theirs are.
 
     A warp has `CONTACTS_A_WARP` contacts. A lane takes the next of them when it is done with one, so that none waits
@@ -128,9 +119,9 @@ def keep_nearest_kernel(
         if i < 0 and is_nearest_only(contacts, curves_inout, queue + (rank & 0xFFFF), end):
             i = queue + (rank & 0xFFFF)
             turn, j, p = wp.int32(0), i, rows.faces[i][0]
-            a = wp.min(pairs[p][0], pairs[p][1])
-            back = wp.transpose(objects.rotation[a])
-            row = make_row(pair_poses[p], back, objects.position[a], contacts.p0[i], contacts.p1[i])
+            a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
+            back = wp.transpose(trees.objects.rotation[a])
+            row = make_row(batch.poses[p], back, trees.objects.position[a], contacts.p0[i], contacts.p1[i])
         queue += rank >> 16
         if i >= 0:
             found = next_neighbour(i, turn, j, rows, contacts)
@@ -139,7 +130,7 @@ def keep_nearest_kernel(
                 i = wp.int32(-1)
             else:
                 face = rows.faces[found[2]][wp.where(turn == 2, 1, 2)]
-                if is_nearer(models, states, pair_poses[p], row, face, turn == 2):
+                if is_nearer(trees, batch.poses[p], row, face, turn == 2):
                     curves_inout.depth[i, 0] = NO_POINT
                     curves_inout.depth[i, 1] = NO_POINT
                     i = wp.int32(-1)
@@ -184,13 +175,7 @@ def write_near_candidates(
 
 @wp.kernel
 def find_near_candidate_kernel(
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    rows: Rows,
-    contacts: Contacts,
-    facing_inout: Deferred,
-    curves_inout: Curves,
+    objects: ObjectPool, batch: PairBatch, rows: Rows, contacts: Contacts, facing_inout: Deferred, curves_inout: Curves
 ):
     """Find the candidate of one contact of faces that are apart a thread: their nearest points; or list it.
 
@@ -209,9 +194,9 @@ def find_near_candidate_kernel(
         listed = -wp.dot(normal_a, normal_b) >= OPPOSED_LEAST and along >= ALONG
         if not listed:
             p = rows.faces[i][0]
-            a, zero = wp.min(pairs[p][0], pairs[p][1]), wp.vec3d()
+            a, zero = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.vec3d()
             none = wp.vec2d(NO_DEPTH, NO_DEPTH)
-            scale = pair_poses[p].scale
+            scale = batch.poses[p].scale
             write_near_candidates(i, objects, a, scale, zero, none, zero, zero, contacts, curves_inout)
     slot = reserve_slot(facing_inout.total, listed)
     if listed:
@@ -220,11 +205,8 @@ def find_near_candidate_kernel(
 
 @wp.kernel
 def find_facing_candidate_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     gap: wp.array(dtype=wp.float64),
     rows: Rows,
     contacts: Contacts,
@@ -245,11 +227,11 @@ def find_facing_candidate_kernel(
     i = facing.place[k]
     own = rows.faces[i]
     p = own[0]
-    pose = pair_poses[p]
-    a = wp.min(pairs[p][0], pairs[p][1])
-    back = wp.transpose(objects.rotation[a])
+    pose = batch.poses[p]
+    a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
+    back = wp.transpose(trees.objects.rotation[a])
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    load_corners(models, states, pose, own[1 + pose.swapped], own[2 - pose.swapped], corner)
+    load_corners(trees, pose, own[1 + pose.swapped], own[2 - pose.swapped], corner)
     normal_a, normal_b = back * contacts.normal_a[i], back * contacts.normal_b[i]
     first = 3 * pose.swapped
     n = normal_a
@@ -260,4 +242,4 @@ def find_facing_candidate_kernel(
         if d > NO_DEPTH and (depth == NO_DEPTH or d < depth):
             n, depth, point, other, second = -normal_b, d, x, e, y
     depths = wp.vec2d(depth, other)
-    write_near_candidates(i, objects, a, pose.scale, n, depths, point, second, contacts, curves_inout)
+    write_near_candidates(i, trees.objects, a, pose.scale, n, depths, point, second, contacts, curves_inout)

@@ -6,6 +6,7 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.lanes import warp_any
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.contacts.candidates import (
     CANDIDATES,
     best_of_group,
@@ -280,7 +281,7 @@ def point_spreader(most: int):
     def spread_point_kernel(
         largest: wp.int32,
         objects: ObjectPool,
-        pairs: wp.array(dtype=wp.vec2i),
+        batch: PairBatch,
         gap: wp.array(dtype=wp.float64),
         start: wp.array(dtype=wp.int32),
         curves_inout: Curves,
@@ -297,7 +298,7 @@ def point_spreader(most: int):
         if contacts <= 0:
             manifolds_out.count[p] = 0
             return
-        along = order_direction(objects.rotation[wp.min(pairs[p][0], pairs[p][1])])
+        along = order_direction(objects.rotation[wp.min(batch.pairs[p][0], batch.pairs[p][1])])
         spread_points(p, along, gap, start, curves_inout, manifolds_out)
 
     return spread_point_kernel
@@ -312,7 +313,7 @@ def large_point_spreader(most: int):
     def spread_large_point_kernel(
         blocks: wp.int32,
         objects: ObjectPool,
-        pairs: wp.array(dtype=wp.vec2i),
+        batch: PairBatch,
         gap: wp.array(dtype=wp.float64),
         start: wp.array(dtype=wp.int32),
         large: Deferred,
@@ -323,7 +324,7 @@ def large_point_spreader(most: int):
         k = wp.tid() / group_size()
         while k < large.total[0]:
             p = large.place[k]
-            along = order_direction(objects.rotation[wp.min(pairs[p][0], pairs[p][1])])
+            along = order_direction(objects.rotation[wp.min(batch.pairs[p][0], batch.pairs[p][1])])
             spread_points(p, along, gap, start, curves_inout, manifolds_out)
             k += blocks
 

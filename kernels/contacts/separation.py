@@ -7,9 +7,9 @@ shortest motion that parts them, and the direction is a normal of either face or
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.counters import reserve_slot
-from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.contacts.contact import (
     Contacts,
     Deferred,
@@ -151,9 +151,8 @@ def mark_near_kernel(
 
 @wp.kernel(cuda_max_registers=128)
 def find_separation_kernel(
-    models: ModelPool,
-    states: StatePool,
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     contacts_inout: Contacts,
@@ -164,25 +163,16 @@ def find_separation_kernel(
         return
     row = faces[i]
     p = row[0]
-    swapped = pair_poses[p].swapped
-    t = load_triangles(models, states, pair_poses[p], row[1 + swapped], row[2 - swapped])
+    swapped = batch.poses[p].swapped
+    t = load_triangles(trees, batch.poses[p], row[1 + swapped], row[2 - swapped])
     contacts_inout.separation[i] = -wp.max(crossing_depth(t) * t.size, LEAST_SEPARATION)
 
 
 @wp.func
-def write_near_contact(
-    i: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    own: PairObjects,
-    pose: PairPose,
-    row: wp.vec3i,
-    contacts: Contacts,
-):
+def write_near_contact(i: wp.int32, trees: Trees, own: PairObjects, pose: PairPose, row: wp.vec3i, contacts: Contacts):
     """Compute the contact of two faces that are apart."""
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    load_corners(models, states, pose, row[1 + own.swapped], row[2 - own.swapped], corner)
+    load_corners(trees, pose, row[1 + own.swapped], row[2 - own.swapped], corner)
     t = scale_triangles(corner[0], corner[1], corner[2], corner[3], corner[4], corner[5])
     near = nearest_features(t)
     contacts.separation[i] = wp.max(wp.sqrt(near.square) * t.size, LEAST_SEPARATION)
@@ -190,7 +180,7 @@ def write_near_contact(
     u, v = feature_weights(near)
     point_a = u[0] * corner[0] + u[1] * corner[1] + u[2] * corner[2]
     point_b = v[0] * corner[3] + v[1] * corner[4] + v[2] * corner[5]
-    rotation, position = objects.rotation[own.a], objects.position[own.a]
+    rotation, position = trees.objects.rotation[own.a], trees.objects.position[own.a]
     end_a, end_b = pose_point(rotation, position, point_a), pose_point(rotation, position, point_b)
     normal_a = unit_vector(rotation * plain_normal(corner[0], corner[1], corner[2]))
     normal_b = unit_vector(rotation * plain_normal(corner[3], corner[4], corner[5]))
@@ -198,7 +188,7 @@ def write_near_contact(
     if near.square <= CLOSEST:
         normal = blend_normals(normal_a, normal_b)
         if wp.dot(normal, normal) == wp.float64(0.0):
-            normal = pair_direction(models, states, objects, own.a, own.b)
+            normal = pair_direction(trees, own.a, own.b)
     back = own.swapped != 0
     contacts.p0[i] = wp.where(back, end_b, end_a)
     contacts.p1[i] = wp.where(back, end_a, end_b)
@@ -210,11 +200,8 @@ def write_near_contact(
 @wp.kernel(cuda_max_registers=128)
 def find_near_contact_kernel(
     step: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     faces: wp.array(dtype=wp.vec3i),
     listed: Deferred,
     uncertain_only: bool,
@@ -230,6 +217,6 @@ def find_near_contact_kernel(
         i = listed.place[listed.place.shape[0] - 1 - k]
         if not uncertain_only or contacts_inout.separation[i] == LEAST_SEPARATION:
             p = faces[i][0]
-            own = contact_objects(pairs, pair_poses, p)
-            write_near_contact(i, models, states, objects, own, pair_poses[p], faces[i], contacts_inout)
+            own = contact_objects(batch, p)
+            write_near_contact(i, trees, own, batch.poses[p], faces[i], contacts_inout)
         k += step

@@ -3,9 +3,9 @@
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
 from warp_abtree.kernels.base.lanes import six_numbers
-from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.contacts.contact import Contacts, Deferred, contact_objects
 from warp_abtree.kernels.contacts.summary import PairContacts, mean_normal, write_no_contacts
 from warp_abtree.kernels.contacts.travel import choose_travel, reach_contacts
@@ -54,11 +54,8 @@ def simd_sum_areas(contacts: Contacts, ends: wp.vec2i, middle: wp.vec3d, normal:
 
 @wp.kernel
 def find_pair_contacts_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     proven: bool,
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
@@ -67,14 +64,14 @@ def find_pair_contacts_kernel(
 ):
     """Compute the contacts of one object pair, or defer them; one thread after the other, CPU only."""
     p = wp.tid()
-    a = wp.min(pairs[p][0], pairs[p][1])
+    a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
     if start[p] < start[p + 1]:
         deferred_inout.total[0] = simd_contacts(
-            models,
-            states,
-            pair_poses[p],
-            objects.rotation[a],
-            objects.position[a],
+            trees.models,
+            trees.states,
+            batch.poses[p],
+            trees.objects.rotation[a],
+            trees.objects.position[a],
             proven,
             wp.vec3i(start[p], start[p + 1], deferred_inout.total[0]),
             faces,
@@ -85,11 +82,8 @@ def find_pair_contacts_kernel(
 
 @wp.kernel
 def sum_pair_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     contacts: Contacts,
@@ -104,16 +98,14 @@ def sum_pair_kernel(
         return
     means = simd_sum_means(contacts, ends, lengths[0], lengths[1])
     middle = wp.vec3d(means[0], means[1], means[2])
-    n = mean_normal(models, states, objects, pairs[p], wp.vec3d(means[3], means[4], means[5]))
+    n = mean_normal(trees, batch.pairs[p], wp.vec3d(means[3], means[4], means[5]))
     areas = simd_sum_areas(contacts, ends, middle, n)
     origin = contacts.p0[ends[0]]
     front, back = wp.float64(0.0), wp.float64(0.0)
     if areas[0] == wp.float64(0.0):
-        own = contact_objects(pairs, pair_poses, p)
+        own = contact_objects(batch, p)
         span = wp.vec3i(p, ends[0], ends[1])
-        front, back = reach_contacts(models, states, objects, own, pair_poses[p], span, faces, contacts, n, origin)
+        front, back = reach_contacts(trees, own, batch.poses[p], span, faces, contacts, n, origin)
     pair_contacts_out.normal[p] = n
     pair_contacts_out.point[p] = origin + middle
-    pair_contacts_out.travel[p] = choose_travel(
-        models, states, objects, pairs[p], n, origin, areas[0], areas[1], front - back
-    )
+    pair_contacts_out.travel[p] = choose_travel(trees, batch.pairs[p], n, origin, areas[0], areas[1], front - back)

@@ -8,9 +8,9 @@ the other (`simd`).
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool, no_vector
+from warp_abtree.kernels.base.arrays import Trees, no_vector
 from warp_abtree.kernels.base.lanes import add_in_order, six_numbers, warp_any, warp_lane, warp_max, warp_size
-from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.contacts.chunks import end_chunk, first_chunk
 from warp_abtree.kernels.contacts.contact import (
     SHORTEST_NORMAL,
@@ -145,21 +145,18 @@ def sum_means(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
 
 
 @wp.func
-def mean_normal(models: ModelPool, states: StatePool, objects: ObjectPool, pair: wp.vec2i, sum: wp.vec3d):
+def mean_normal(trees: Trees, pair: wp.vec2i, sum: wp.vec3d):
     """Return the unit normal of a sum of weighted normals; where it is short, the direction between the models."""
     n = sum
     if measure_length(n) <= SHORTEST_NORMAL:
-        n = pair_direction(models, states, objects, pair[0], pair[1])
+        n = pair_direction(trees, pair[0], pair[1])
     return unit_vector(n)
 
 
 @wp.kernel(cuda_max_registers=96)
 def sum_loop_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     contacts: Contacts,
@@ -179,7 +176,7 @@ def sum_loop_kernel(
     p = span[0]
     origin = contacts.p0[start[p]]
     middle, normals = sum_means(p, start, sums_inout)
-    n = mean_normal(models, states, objects, pairs[p], normals)
+    n = mean_normal(trees, batch.pairs[p], normals)
     sums = six_numbers()
     first = wp.int32(span[1])
     while first < span[2]:
@@ -196,8 +193,8 @@ def sum_loop_kernel(
     front = wp.float64(wp.nan)
     back = wp.float64(wp.nan)
     if sums[0] == wp.float64(0.0):
-        own = contact_objects(pairs, pair_poses, p)
-        front, back = reach_contacts(models, states, objects, own, pair_poses[p], span, faces, contacts, n, origin)
+        own = contact_objects(batch, p)
+        front, back = reach_contacts(trees, own, batch.poses[p], span, faces, contacts, n, origin)
     if warp_lane() == 0:
         sums_inout.area[c] = sums[0]
         sums_inout.change[c] = sums[1]
@@ -236,11 +233,8 @@ def write_no_contacts(p: wp.int32, pair_contacts: PairContacts):
 
 @wp.kernel(cuda_max_registers=96)
 def measure_travel_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     contacts: Contacts,
@@ -258,11 +252,9 @@ def measure_travel_kernel(
     n = pair_contacts_inout.normal[p]
     area, change, front, back, measured = sum_chunks(p, start, sums)
     if area == wp.float64(0.0) and not measured:
-        own = contact_objects(pairs, pair_poses, p)
+        own = contact_objects(batch, p)
         span = wp.vec3i(p, start[p], start[p + 1])
-        front, back = reach_contacts(models, states, objects, own, pair_poses[p], span, faces, contacts, n, origin)
+        front, back = reach_contacts(trees, own, batch.poses[p], span, faces, contacts, n, origin)
     if warp_lane() == 0:
         pair_contacts_inout.point[p] = origin + sums.middle[p]
-        pair_contacts_inout.travel[p] = choose_travel(
-            models, states, objects, pairs[p], n, origin, area, change, front - back
-        )
+        pair_contacts_inout.travel[p] = choose_travel(trees, batch.pairs[p], n, origin, area, change, front - back)

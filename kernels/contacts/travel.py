@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.base.arrays import Trees, load_vertex
 from warp_abtree.kernels.base.lanes import warp_lane, warp_max, warp_size
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import PairPose, pose_point
@@ -15,14 +15,16 @@ LEAST_SINE_SQUARED = wp.constant(wp.float64(2.0**-40))
 
 
 @wp.func
-def box_support(models: ModelPool, states: StatePool, objects: ObjectPool, i: wp.int32, n: wp.vec3d, origin: wp.vec3d):
+def box_support(trees: Trees, i: wp.int32, n: wp.vec3d, origin: wp.vec3d):
     """Return the support of a posed object's root box along n from a point, world frame."""
-    state = objects.state[i]
-    root = load_node(states, states.node_start[state] + 1)
+    state = trees.objects.state[i]
+    root = load_node(trees.states, trees.states.node_start[state] + 1)
     lower = wp.vec3d(root.lower)
     upper = wp.vec3d(root.upper)
-    centre = pose_point(objects.rotation[i], objects.position[i], models.centre[states.model[state]])
-    m = wp.transpose(objects.rotation[i]) * n
+    centre = pose_point(
+        trees.objects.rotation[i], trees.objects.position[i], trees.models.centre[trees.states.model[state]]
+    )
+    m = wp.transpose(trees.objects.rotation[i]) * n
     reach = wp.dot(n, centre - origin)
     for k in range(3):
         reach += wp.max(m[k] * lower[k], m[k] * upper[k])
@@ -44,26 +46,17 @@ def loop_change(segment: wp.vec3d, normal_a: wp.vec3d, normal_b: wp.vec3d, n: wp
 
 
 @wp.func
-def reach_faces(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    own: PairObjects,
-    pose: PairPose,
-    face: wp.vec3i,
-    n: wp.vec3d,
-    origin: wp.vec3d,
-):
+def reach_faces(trees: Trees, own: PairObjects, pose: PairPose, face: wp.vec3i, n: wp.vec3d, origin: wp.vec3d):
     """Return the supports of the first object's face along n from a point, and of the second's against it."""
-    a = states.face_corner[pose.corner_a + face[1 + own.swapped]]
-    b = states.face_corner[pose.corner_b + face[2 - own.swapped]]
+    a = trees.states.face_corner[pose.corner_a + face[1 + own.swapped]]
+    b = trees.states.face_corner[pose.corner_b + face[2 - own.swapped]]
     front = -wp.float64(wp.inf)
     back = -wp.float64(wp.inf)
     for i in range(3):
-        corner_a = load_vertex(models.vertex_pos, a[i])
-        corner_b = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[i]))
-        reach_a = wp.dot(n, pose_point(objects.rotation[own.a], objects.position[own.a], corner_a) - origin)
-        reach_b = wp.dot(n, pose_point(objects.rotation[own.a], objects.position[own.a], corner_b) - origin)
+        corner_a = load_vertex(trees.models.vertex_pos, a[i])
+        corner_b = pose_point(pose.rotation, pose.translation, load_vertex(trees.models.vertex_pos, b[i]))
+        reach_a = wp.dot(n, pose_point(trees.objects.rotation[own.a], trees.objects.position[own.a], corner_a) - origin)
+        reach_b = wp.dot(n, pose_point(trees.objects.rotation[own.a], trees.objects.position[own.a], corner_b) - origin)
         # The normal goes from the object that the pair names first.
         front = wp.max(front, wp.where(own.swapped == 0, reach_a, reach_b))
         back = wp.max(back, -wp.where(own.swapped == 0, reach_b, reach_a))
@@ -72,9 +65,7 @@ def reach_faces(
 
 @wp.func
 def reach_contacts(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
+    trees: Trees,
     own: PairObjects,
     pose: PairPose,
     span: wp.vec3i,
@@ -89,7 +80,7 @@ def reach_contacts(
     k = span[1] + warp_lane()
     while k < span[2]:
         if have_crossed(contacts, k):
-            ahead, behind = reach_faces(models, states, objects, own, pose, faces[k], n, origin)
+            ahead, behind = reach_faces(trees, own, pose, faces[k], n, origin)
             front = wp.max(front, ahead)
             back = wp.max(back, behind)
         k += warp_size()
@@ -98,9 +89,7 @@ def reach_contacts(
 
 @wp.func
 def choose_travel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
+    trees: Trees,
     pair: wp.vec2i,
     n: wp.vec3d,
     origin: wp.vec3d,
@@ -109,8 +98,8 @@ def choose_travel(
     overlap: wp.float64,
 ):
     """Return the travel of a pair, `overlap` that of its faces where there is no area."""
-    travel = box_support(models, states, objects, pair[0], n, origin)
-    travel += box_support(models, states, objects, pair[1], -n, origin)
+    travel = box_support(trees, pair[0], n, origin)
+    travel += box_support(trees, pair[1], -n, origin)
     if area == wp.float64(0.0):
         travel = wp.min(travel, overlap)
     elif area * change < wp.float64(0.0):

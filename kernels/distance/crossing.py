@@ -7,10 +7,10 @@ lie on one stack in their order, a hit drops what comes after it, and the search
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.lanes import warp_lane, warp_min_item, warp_size, warp_sync
-from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.distance.frame import NO_FACES, NearestFound, SearchScale
 from warp_abtree.kernels.distance.node_pair import bound_children
 from warp_abtree.kernels.distance.report import Distances, write_nearest
@@ -34,11 +34,11 @@ def push_in_order(items: wp.uint64, end: wp.int32, kinds: wp.vec4i, children: fo
 
 
 @wp.func
-def search_crossing(models: ModelPool, states: StatePool, pose: PairPose, scaling: SearchScale, room: wp.int32):
+def search_crossing(trees: Trees, pose: PairPose, scaling: SearchScale, room: wp.int32):
     """Return the first faces of an object pair that intersect, NO_FACES where none do."""
     items = nearest_stack()
     if warp_lane() == 0:
-        write_item(items, 0, first_item(states, pose))
+        write_item(items, 0, first_item(trees.states, pose))
         write_bound(items, 0, wp.float32(NODES))
     warp_sync()
     found = NO_FACES
@@ -54,16 +54,16 @@ def search_crossing(models: ModelPool, states: StatePool, pose: PairPose, scalin
         warp_sync()
         crosses = False
         if kind == FACES:
-            crosses = test_faces(EXACT, models, states, pose, item_first(item), item_second(item)) == 1
+            crosses = test_faces(EXACT, trees, pose, item_first(item), item_second(item)) == 1
         first = wp.int32(warp_min_item(wp.where(crosses, wp.int64(warp_lane()), wp.int64(popped))))
         if first < popped:
             end = 0
             found = warp_min_item(wp.where(first == warp_lane(), item, NO_FACES))
         live = wp.where(kind == NODES and warp_lane() < first, -1, 0)
         if kind != NODES:
-            item = first_item(states, pose)
+            item = first_item(trees.states, pose)
         children, kinds, _bounds, _tests = bound_children(
-            False, states, Slabs(), pose, scaling, wp.float32(0.0), item, live
+            False, trees.states, Slabs(), pose, scaling, wp.float32(0.0), item, live
         )
         end = push_in_order(items, end, kinds, children)
         warp_sync()
@@ -71,50 +71,32 @@ def search_crossing(models: ModelPool, states: StatePool, pose: PairPose, scalin
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
-def search_crossing_kernel(
-    room: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pair_count: wp.array(dtype=wp.int32),
-    pair_poses: wp.array(dtype=PairPose),
-    hits: Hits,
-    found_inout: NearestFound,
-):
+def search_crossing_kernel(room: wp.int32, trees: Trees, batch: PairBatch, hits: Hits, found_inout: NearestFound):
     """Find the first crossing faces of the object pairs that intersect, a warp a pair."""
     p = wp.tid() / warp_size()
-    if p >= pair_count[0] or found_inout.launched[0] == STALE:
+    if p >= batch.count[0] or batch.launched[0] == STALE:
         return
     if hits.any_hit[p] != 1:
         return
-    faces = search_crossing(models, states, pair_poses[p], found_inout.scaling[p], room)
+    faces = search_crossing(trees, batch.poses[p], found_inout.scaling[p], room)
     if warp_lane() == 0:
         found_inout.faces[p] = faces
 
 
 @wp.kernel
-def report_crossing_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    found: NearestFound,
-    hits: Hits,
-    distances_out: Distances,
-):
+def report_crossing_kernel(trees: Trees, batch: PairBatch, found: NearestFound, hits: Hits, distances_out: Distances):
     """Report the faces of an object pair that intersects, and the middle of what they share, a thread a pair."""
     p = wp.tid()
-    if p >= pair_count[0] or found.launched[0] == STALE:
+    if p >= batch.count[0] or batch.launched[0] == STALE:
         return
     if hits.any_hit[p] != 1 or found.faces[p] == NO_FACES:
         return
-    pose = pair_poses[p]
+    pose = batch.poses[p]
     face_a, face_b = item_first(found.faces[p]), item_second(found.faces[p])
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    load_corners(models, states, pose, face_a, face_b, corner)
+    load_corners(trees, pose, face_a, face_b, corner)
     p0, p1, _ = intersect_faces(pose.scale, corner)
-    a = wp.min(pairs[p][0], pairs[p][1])
+    a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
     middle = wp.float64(0.5) * (p0 + p1)
-    point = pose_point(objects.rotation[a], objects.position[a], middle)
+    point = pose_point(trees.objects.rotation[a], trees.objects.position[a], middle)
     write_nearest(p, pose.swapped, face_a, face_b, point, point, distances_out)

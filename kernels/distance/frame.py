@@ -22,7 +22,7 @@ D is small: `stretch` and `slack_of`.
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.boxes import ROUNDING_DOWN, ROUNDING_UP
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.nodes import load_node
@@ -31,6 +31,7 @@ from warp_abtree.kernels.base.poses import (
     ROUNDING_64,
     SCALE_MAX,
     UNIT_32,
+    PairBatch,
     PairPose,
     measure_rotation,
     reach_box,
@@ -104,16 +105,16 @@ class NearestFound:
     beyond: wp.array(dtype=wp.float64)  # distance to end at [world units], infinite for none, shape [pair]
     # What no nearest faces are beyond, scaled, and 0 where slabs do not pay, else 1; shape [pair], of warps alone.
     upper: wp.array(dtype=wp.vec2)
-    launched: wp.array(dtype=wp.int32)  # STALE where nothing is to be done, see `generation.LaunchRecord`
 
 
 @wp.func
-def make_scale(models: ModelPool, states: StatePool, objects: ObjectPool, pose: PairPose, a: wp.int32, b: wp.int32):
+def make_scale(trees: Trees, pose: PairPose, a: wp.int32, b: wp.int32):
     """Return the `SearchScale` of objects a < b."""
-    state_a, state_b = objects.state[a], objects.state[b]
-    centre_a, centre_b = models.centre[states.model[state_a]], models.centre[states.model[state_b]]
-    root_a = load_node(states, states.node_start[state_a] + 1)
-    root_b = load_node(states, states.node_start[state_b] + 1)
+    state_a, state_b = trees.objects.state[a], trees.objects.state[b]
+    centre_a = trees.models.centre[trees.states.model[state_a]]
+    centre_b = trees.models.centre[trees.states.model[state_b]]
+    root_a = load_node(trees.states, trees.states.node_start[state_a] + 1)
+    root_b = load_node(trees.states, trees.states.node_start[state_b] + 1)
     reach_a = reach_box(root_a.lower, root_a.upper)
     reach_b = reach_box(root_b.lower, root_b.upper)
     r, t = pose.rotation, pose.translation
@@ -133,9 +134,9 @@ def make_scale(models: ModelPool, states: StatePool, objects: ObjectPool, pose: 
     power = wp.cast(wp.cast(most, wp.int64) & EXPONENT_BITS, wp.float64)
     scale = wp.min(wp.float64(1.0) / power, SCALE_MAX)
     one = wp.float64(1.0)
-    skew_a, skew_b = skew_of(objects.rotation[a]), skew_of(objects.rotation[b])
+    skew_a, skew_b = skew_of(trees.objects.rotation[a]), skew_of(trees.objects.rotation[b])
     sizes = (reach_a + largest_coordinate(centre_a)) + (reach_b + largest_coordinate(centre_b))
-    sizes = sizes + largest_coordinate(objects.position[b] - objects.position[a])
+    sizes = sizes + largest_coordinate(trees.objects.position[b] - trees.objects.position[a])
     scaling = SearchScale()
     scaling.translation = wp.vec3(shift * scale)
     scaling.back = wp.vec3(back * scale)
@@ -195,26 +196,18 @@ def tolerance_terms(tolerances: Tolerances, scaling: SearchScale):
 
 
 @wp.func
-def is_active(models: ModelPool, states: StatePool, state: wp.int32, face: wp.int32):
-    if face < 0 or face >= models.face_count[states.model[state]]:
+def is_active(trees: Trees, state: wp.int32, face: wp.int32):
+    if face < 0 or face >= trees.models.face_count[trees.states.model[state]]:
         return False
-    return states.face_corner[states.face_start[state] + face][0] >= 0
+    return trees.states.face_corner[trees.states.face_start[state] + face][0] >= 0
 
 
 @wp.func
-def start_pair(
-    p: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    found: NearestFound,
-):
+def start_pair(p: wp.int32, trees: Trees, batch: PairBatch, found: NearestFound):
     """Prepare an object pair, with the last launch's faces as the first bound where both are active."""
-    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
-    pose = pair_poses[p]
-    scaling = make_scale(models, states, objects, pose, a, b)
+    a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
+    pose = batch.poses[p]
+    scaling = make_scale(trees, pose, a, b)
     bound = found.beyond[p]
     if bound < DISTANCE_MAX:
         bound = bound * scaling.stretch + (scaling.slack + scaling.pair_slack)
@@ -223,8 +216,8 @@ def start_pair(
     faces = found.faces[p]
     kept = NO_FACES
     face_a, face_b = wp.int32(faces >> wp.int64(32)), wp.int32(faces & wp.int64(0x7FFFFFFF))
-    if is_active(models, states, objects.state[a], face_a) and is_active(models, states, objects.state[b], face_b):
-        triangles = load_triangles(models, states, pose, face_a, face_b)
+    if is_active(trees, trees.objects.state[a], face_a) and is_active(trees, trees.objects.state[b], face_b):
+        triangles = load_triangles(trees, pose, face_a, face_b)
         d = triangle_distance(triangles)
         if d <= bound:
             bound = d
@@ -237,26 +230,21 @@ def start_pair(
 
 
 @wp.func
-def should_use_slabs(count: wp.int32, models: ModelPool, states: StatePool, a: wp.int32, b: wp.int32):
+def should_use_slabs(count: wp.int32, trees: Trees, a: wp.int32, b: wp.int32):
     """Return whether slabs shorten a search by warps: not where many warps share few pairs.
 
     Args:
         a, b: Tree states of the object pair.
     """
-    return count >= PAIRS_LEAST or models.depth[states.model[a]] + models.depth[states.model[b]] >= DEPTH_LEAST
+    return (
+        count >= PAIRS_LEAST
+        or trees.models.depth[trees.states.model[a]] + trees.models.depth[trees.states.model[b]] >= DEPTH_LEAST
+    )
 
 
 @wp.kernel
 def start_distance_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    slabs_inout: Slabs,
-    found_inout: NearestFound,
-    work_out: Work,
+    trees: Trees, batch: PairBatch, slabs_inout: Slabs, found_inout: NearestFound, work_out: Work
 ):
     """Prepare an object pair a thread, see `start_pair`.
 
@@ -266,16 +254,16 @@ def start_distance_kernel(
     if p < work_out.flag.shape[0]:
         work_out.flag[p] = 0
     if p == 0:
-        stale = found_inout.launched[0] == STALE
+        stale = batch.launched[0] == STALE
         work_out.counter[0] = 0
         work_out.counter[1] = 0
-        work_out.counter[2] = wp.where(stale, 0, wp.min(pair_count[0], pairs.shape[0]))
+        work_out.counter[2] = wp.where(stale, 0, wp.min(batch.count[0], batch.pairs.shape[0]))
         work_out.counter[3] = wp.where(stale, NO_UNIT, 0)
-    if p >= wp.min(pair_count[0], pairs.shape[0]) or found_inout.launched[0] == STALE:
+    if p >= wp.min(batch.count[0], batch.pairs.shape[0]) or batch.launched[0] == STALE:
         return
-    a, b = objects.state[pairs[p][0]], objects.state[pairs[p][1]]
-    if should_use_slabs(pair_count[0], models, states, a, b):
-        count_uses(p, models, states, objects, pairs, slabs_inout)
+    a, b = trees.objects.state[batch.pairs[p][0]], trees.objects.state[batch.pairs[p][1]]
+    if should_use_slabs(batch.count[0], trees, a, b):
+        count_uses(p, trees, batch.pairs, slabs_inout)
     else:
         slabs_inout.states[p] = wp.vec2i(-1, -1)
-    start_pair(p, models, states, objects, pairs, pair_poses, found_inout)
+    start_pair(p, trees, batch, found_inout)

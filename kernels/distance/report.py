@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool, load_vertex, no_vector
+from warp_abtree.kernels.base.arrays import ModelPool, Trees, load_vertex, no_vector
 from warp_abtree.kernels.base.generation import STALE
-from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.base.poses import PairBatch, pose_point
 from warp_abtree.kernels.distance.frame import NO_FACES, NearestFound, Tolerances, cut_of, slack_of
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.search.item import item_first, item_second
@@ -61,11 +61,8 @@ def blend_corners(models: ModelPool, corner: wp.vec4i, weights: wp.vec3d):
 def report_pair(
     p: wp.int32,
     tolerances: Tolerances,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     found: NearestFound,
     hits: Hits,
     distances: Distances,
@@ -76,7 +73,7 @@ def report_pair(
         distances.distance[p] = zero
         distances.bracket[p] = wp.vec2d(zero, zero)
         return
-    pose = pair_poses[p]
+    pose = batch.poses[p]
     if found.faces[p] == NO_FACES:
         beyond = wp.min(found.beyond[p], DISTANCE_MAX)
         distances.distance[p] = wp.float64(wp.inf)
@@ -90,31 +87,22 @@ def report_pair(
     distances.distance[p] = wp.max(d, LEAST_DISTANCE)
     distances.bracket[p] = wp.vec2d(lower, wp.max(d * scaling.stretch + slack_of(scaling, d), LEAST_DISTANCE))
     face_a, face_b = item_first(found.faces[p]), item_second(found.faces[p])
-    near = nearest_features(load_triangles(models, states, pose, face_a, face_b))
+    near = nearest_features(load_triangles(trees, pose, face_a, face_b))
     weights_a, weights_b = feature_weights(near)
-    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
-    point_a = blend_corners(models, states.face_corner[pose.corner_a + face_a], weights_a)
-    point_b = blend_corners(models, states.face_corner[pose.corner_b + face_b], weights_b)
-    point_a = pose_point(objects.rotation[a], objects.position[a], point_a)
-    point_b = pose_point(objects.rotation[b], objects.position[b], point_b)
+    a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
+    point_a = blend_corners(trees.models, trees.states.face_corner[pose.corner_a + face_a], weights_a)
+    point_b = blend_corners(trees.models, trees.states.face_corner[pose.corner_b + face_b], weights_b)
+    point_a = pose_point(trees.objects.rotation[a], trees.objects.position[a], point_a)
+    point_b = pose_point(trees.objects.rotation[b], trees.objects.position[b], point_b)
     write_nearest(p, pose.swapped, face_a, face_b, point_a, point_b, distances)
 
 
 @wp.kernel
 def report_distance_kernel(
-    tolerances: Tolerances,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    found: NearestFound,
-    hits: Hits,
-    distances_out: Distances,
+    tolerances: Tolerances, trees: Trees, batch: PairBatch, found: NearestFound, hits: Hits, distances_out: Distances
 ):
     """Report an object pair a thread, see `report_pair`."""
     p = wp.tid()
-    if p >= pair_count[0] or found.launched[0] == STALE:
+    if p >= batch.count[0] or batch.launched[0] == STALE:
         return
-    report_pair(p, tolerances, models, states, objects, pairs, pair_poses, found, hits, distances_out)
+    report_pair(p, tolerances, trees, batch, found, hits, distances_out)

@@ -7,7 +7,7 @@ lowest pair, are found whatever the order. With a tolerance other faces are foun
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.boxes import ROUNDING_DOWN
 from warp_abtree.kernels.base.counters import add_warp_sum
 from warp_abtree.kernels.base.lanes import (
@@ -19,7 +19,7 @@ from warp_abtree.kernels.base.lanes import (
     warp_size,
     warp_sync,
 )
-from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.distance.frame import (
     NO_FACES,
     NearestFound,
@@ -100,8 +100,7 @@ def bound_waiting(
     limit: wp.float32,
     upper: wp.float32,
     search: Search,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     found: NearestFound,
 ):
     """Bound face pairs in float32, one a lane; keep those that may be nearest, and return how many there are."""
@@ -113,7 +112,7 @@ def bound_waiting(
     if live:
         pose, scaling = search.pose, search.scaling
         face_a, face_b = item_first(item), item_second(item)
-        a, b = load_points(models, states, pose, scaling.translation, scaling.scale, face_a, face_b)
+        a, b = load_points(trees, pose, scaling.translation, scaling.scale, face_a, face_b)
         between = bound_faces(search.scaling.error, a, b)
     least = warp_min32(between[1])
     if least < upper:
@@ -130,8 +129,7 @@ def decide_open(
     popped: wp.int32,
     upper: wp.float32,
     pair: wp.int32,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pair_poses: wp.array(dtype=PairPose),
     found: NearestFound,
 ):
@@ -146,7 +144,7 @@ def decide_open(
     if warp_any(live):
         d = wp.float64(wp.inf)
         if live:
-            d = triangle_distance(load_triangles(models, states, pair_poses[pair], item_first(item), item_second(item)))
+            d = triangle_distance(load_triangles(trees, pair_poses[pair], item_first(item), item_second(item)))
         least = warp_min(d)
         lowest = warp_min_item(wp.where(d == least, item, NO_FACES))
         if least <= load_distance(found.distance, pair):
@@ -190,14 +188,11 @@ def slabs_pay(faces: wp.int32, items: wp.int32):
 
 @wp.func
 def search_items(
-    # static
     search: Search,
     count: wp.int32,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pair_poses: wp.array(dtype=PairPose),
     slabs: Slabs,
-    # state
     found: NearestFound,
     work: Work,
 ):
@@ -223,7 +218,7 @@ def search_items(
             )
             end -= popped
             seen[0] += popped
-            ends, compared = expand_nearest(items, end, popped, waiting, limit, with_slabs, states, slabs, search)
+            ends, compared = expand_nearest(items, end, popped, waiting, limit, with_slabs, trees.states, slabs, search)
             end = item_second(ends)
             waiting = item_first(ends)
             tests[0] += compared
@@ -234,15 +229,13 @@ def search_items(
             seen[1] += popped
             if with_slabs and not slabs_pay(seen[1], seen[0]):
                 lower_upper(found.upper, pair, SLABS_PAY, 0.0)
-            opened, measured = bound_waiting(
-                items, waiting, popped, opened, limit, upper, search, models, states, found
-            )
+            opened, measured = bound_waiting(items, waiting, popped, opened, limit, upper, search, trees, found)
             tests[1] += measured
         if opened > OPEN_LENGTH - warp_size() or (opened > 0 and end == head and waiting == 0):
             popped = wp.min(opened, warp_size())
             opened -= popped
             upper = load_upper(found.upper, pair)[UPPER]
-            decide_open(items, opened, popped, upper, pair, models, states, pair_poses, found)
+            decide_open(items, opened, popped, upper, pair, trees, pair_poses, found)
         idle = count_idle(tickets)
         if idle > 0 and end - head >= 2 * SEARCH_DONATION_LEAST:
             head = donate_items(SEARCH_DONATION_LEAST, pair, idle, items, head, end, work)
@@ -268,10 +261,8 @@ def start_search_items(slot: wp.int32, states: StatePool, pose: PairPose, work: 
 def search_warp_kernel(
     room: wp.int32,
     tolerances: Tolerances,
-    models: ModelPool,
-    states: StatePool,
-    pair_count: wp.array(dtype=wp.int32),
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     slabs_inout: Slabs,
     found_inout: NearestFound,
     hits_inout: Hits,
@@ -281,7 +272,7 @@ def search_warp_kernel(
 
     The slabs that were due have been made.
     """
-    count = wp.min(pair_count[0], pair_poses.shape[0])
+    count = wp.min(batch.count[0], batch.poses.shape[0])
     search = Search()
     search.room = room
     search.tolerances = tolerances
@@ -299,11 +290,11 @@ def search_warp_kernel(
             p = work_inout.owner[slot][0]
         if hits_inout.any_hit[p] == 0:
             search.pair = p
-            search.pose = pair_poses[p]
+            search.pose = batch.poses[p]
             search.scaling = found_inout.scaling[p]
-            search.slabs = has_mean_slabs(states, slabs_inout, p)
-            size = start_search_items(slot, states, search.pose, work_inout)
-            tests = search_items(search, size, models, states, pair_poses, slabs_inout, found_inout, work_inout)
+            search.slabs = has_mean_slabs(trees.states, slabs_inout, p)
+            size = start_search_items(slot, trees.states, search.pose, work_inout)
+            tests = search_items(search, size, trees, batch.poses, slabs_inout, found_inout, work_inout)
             add_warp_sum(hits_inout.node_tests, p, tests[0])
             add_warp_sum(hits_inout.triangle_tests, p, tests[1])
         ended += 1

@@ -9,9 +9,9 @@ between those that may be the nearest. It is the same answer that warps give on 
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
 from warp_abtree.kernels.base.generation import STALE
-from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.distance.frame import (
     NO_FACES,
     Nearest,
@@ -84,8 +84,7 @@ def take_nearest(upper: wp.float32, thread: wp.int32, memory: wp.array2d(dtype=w
 
 @wp.func
 def decide_waiting(
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     scaling: SearchScale,
     thread: wp.int32,
@@ -99,7 +98,7 @@ def decide_waiting(
         item = take_nearest(scaled_up(nearest.distance, scaling), thread, memory)
         searching = item >= wp.int64(0)
         if searching:
-            d = triangle_distance(load_triangles(models, states, pose, item_first(item), item_second(item)))
+            d = triangle_distance(load_triangles(trees, pose, item_first(item), item_second(item)))
             if d < nearest.distance or (d == nearest.distance and item < nearest.faces):
                 nearest.distance = d
                 nearest.faces = item
@@ -108,12 +107,9 @@ def decide_waiting(
 
 @wp.struct
 class SearchRequest:
-    """Object pairs of a launch, and the tolerances of their distances."""
+    """What a launch does, and the tolerances of distances."""
 
-    pair_count: wp.array(dtype=wp.int32)  # shape (1,)
-    pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]
-    pair_poses: wp.array(dtype=PairPose)  # shape [pair]
-    tolerances: Tolerances  # when they are near enough
+    tolerances: Tolerances  # when pairs are near enough
     refreshes: wp.bool  # whether a thread that is still alone makes the slabs that are due
     searches: wp.bool  # whether it, or each of several, then takes pairs
 
@@ -122,9 +118,9 @@ class SearchRequest:
 def search_pair(
     p: wp.int32,
     before: wp.float64,
-    request: SearchRequest,
-    models: ModelPool,
-    states: StatePool,
+    tolerances: Tolerances,
+    trees: Trees,
+    batch: PairBatch,
     slabs: Slabs,
     thread: wp.int32,
     found: NearestFound,
@@ -139,7 +135,7 @@ def search_pair(
     Args:
         before: Distance that the last launch found, NaN where the faces are not of it.
     """
-    pose = request.pair_poses[p]
+    pose = batch.poses[p]
     scaling = found.scaling[p]
     nearest = Nearest()
     nearest.distance = found.distance[p]
@@ -147,20 +143,20 @@ def search_pair(
     diving = nearest.distance == wp.float64(wp.inf)
     if nearest.faces != NO_FACES:
         diving = nearest.distance > wp.float64(2.0) * before or before > wp.float64(2.0) * nearest.distance
-    with_slabs = has_mean_slabs(states, slabs, p)
-    terms = tolerance_terms(request.tolerances, scaling)
+    with_slabs = has_mean_slabs(trees.states, slabs, p)
+    terms = tolerance_terms(tolerances, scaling)
     open_search(
         scaled_up(nearest.distance, scaling),
         nearest.faces != NO_FACES,
         diving,
-        first_item(states, pose),
+        first_item(trees.states, pose),
         thread,
         memory,
     )
     state = wp.vec3i()
     while state[0] == 0:
-        state = search_nearest(models, states, pose, scaling, terms, slabs, with_slabs, thread, memory)
-        nearest = decide_waiting(models, states, pose, scaling, thread, nearest, memory)
+        state = search_nearest(trees.models, trees.states, pose, scaling, terms, slabs, with_slabs, thread, memory)
+        nearest = decide_waiting(trees, pose, scaling, thread, nearest, memory)
     hits.node_tests[p] += wp.int64(state[1])
     hits.triangle_tests[p] += wp.int64(state[2])
     found.distance[p] = nearest.distance
@@ -170,9 +166,8 @@ def search_pair(
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
 def search_thread_kernel(
     request: SearchRequest,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
+    trees: Trees,
+    batch: PairBatch,
     counter_inout: wp.array(dtype=wp.int32),
     slabs_inout: Slabs,
     found_inout: NearestFound,
@@ -184,17 +179,16 @@ def search_thread_kernel(
 
     One launch for all, since a launch takes the host as long as a seventh of a search.
     """
-    if found_inout.launched[0] == STALE:
+    if batch.launched[0] == STALE:
         return
-    pairs, poses = request.pairs, request.pair_poses
-    count = wp.min(request.pair_count[0], poses.shape[0])
+    count = wp.min(batch.count[0], batch.pairs.shape[0])
     if request.refreshes:
         for i in range(counter_inout.shape[0]):
             counter_inout[i] = 0
         slabs_inout.due_count[0] = 0
         for i in range(count):
-            count_uses(i, models, states, objects, pairs, slabs_inout)
-        make_due(0, 1, 0, 1, models, states, slabs_inout)
+            count_uses(i, trees, batch.pairs, slabs_inout)
+        make_due(0, 1, 0, 1, trees, slabs_inout)
     if not request.searches:
         return
     thread = take_thread(counter_inout)
@@ -203,10 +197,10 @@ def search_thread_kernel(
     p = take_unit(counter_inout)
     while p < count:
         before = found_inout.distance[p]
-        start_pair(p, models, states, objects, pairs, poses, found_inout)
+        start_pair(p, trees, batch, found_inout)
         if hits_inout.any_hit[p] == 0:
-            search_pair(p, before, request, models, states, slabs_inout, thread, found_inout, hits_inout, memory_out)
-        report_pair(
-            p, request.tolerances, models, states, objects, pairs, poses, found_inout, hits_inout, distances_out
-        )
+            search_pair(
+                p, before, request.tolerances, trees, batch, slabs_inout, thread, found_inout, hits_inout, memory_out
+            )
+        report_pair(p, request.tolerances, trees, batch, found_inout, hits_inout, distances_out)
         p = take_unit(counter_inout)

@@ -6,9 +6,9 @@ component decides.
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.base.arrays import Trees, load_vertex
 from warp_abtree.kernels.base.generation import STALE
-from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.distance.report import Distances, write_nearest
 from warp_abtree.kernels.inside.components import NO_FACE, Solids
 from warp_abtree.kernels.inside.parity import is_inside
@@ -21,33 +21,23 @@ FIRST_INSIDE, SECOND_INSIDE = wp.constant(2), wp.constant(3)
 
 
 @wp.func
-def probe_of(models: ModelPool, states: StatePool, pose: PairPose, of_b: bool, face: wp.int32):
+def probe_of(trees: Trees, pose: PairPose, of_b: bool, face: wp.int32):
     """Return the first corner of a face of A, or of B, in A's frame."""
-    c = states.face_corner[wp.where(of_b, pose.corner_b, pose.corner_a) + face]
-    x = load_vertex(models.vertex_pos, c[0])
+    c = trees.states.face_corner[wp.where(of_b, pose.corner_b, pose.corner_a) + face]
+    x = load_vertex(trees.models.vertex_pos, c[0])
     if of_b:
         x = pose_point(pose.rotation, pose.translation, x)
     return x
 
 
 @wp.func
-def find_inside(
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    solids: Solids,
-    state: wp.int32,
-    of_b: bool,
-    centre: wp.vec3d,
-):
+def find_inside(trees: Trees, pose: PairPose, solids: Solids, state: wp.int32, of_b: bool, centre: wp.vec3d):
     """Return the lowest face that represents a component inside the solid A, or B, of the other's state; or NO_FACE."""
     lowest = wp.int32(NO_FACE)
     i = wp.int32(0)
     while i < solids.count[state]:
         face = solids.face[solids.first[state] + i]
-        if face < lowest and is_inside(
-            models, states, pose, of_b, centre, probe_of(models, states, pose, not of_b, face)
-        ):
+        if face < lowest and is_inside(trees, pose, of_b, centre, probe_of(trees, pose, not of_b, face)):
             lowest = face
         i += 1
     return lowest
@@ -55,17 +45,9 @@ def find_inside(
 
 @wp.kernel(module="unique", module_options={"enable_backward": False, "fuse_fp": False})
 def find_contained_kernel(
-    # static
-    models: ModelPool,
-    states: StatePool,
-    # state
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     solids: Solids,
-    launched: wp.array(dtype=wp.int32),
-    # out
     hits_inout: Hits,
     near_hit_inout: wp.array(dtype=wp.int32),
     contained_out: wp.array(dtype=wp.int32),
@@ -77,20 +59,20 @@ def find_contained_kernel(
         contained_out: Face of the component that is inside, shape [pair].
     """
     p = wp.tid()
-    if p >= pair_count[0] or p >= pairs.shape[0] or launched[0] == STALE:
+    if p >= batch.count[0] or p >= batch.pairs.shape[0] or batch.launched[0] == STALE:
         return
     if hits_inout.any_hit[p] != 0:
         return
-    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
-    pose = pair_poses[p]
-    centre = models.centre[states.model[objects.state[a]]]
+    a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
+    pose = batch.poses[p]
+    centre = trees.models.centre[trees.states.model[trees.objects.state[a]]]
     face = NO_FACE
     if solids.is_solid[b] != 0:
-        face = find_inside(models, states, pose, solids, objects.state[a], True, centre)
+        face = find_inside(trees, pose, solids, trees.objects.state[a], True, centre)
         if face != NO_FACE:
             hits_inout.any_hit[p] = FIRST_INSIDE
     if face == NO_FACE and solids.is_solid[a] != 0:
-        face = find_inside(models, states, pose, solids, objects.state[b], False, centre)
+        face = find_inside(trees, pose, solids, trees.objects.state[b], False, centre)
         if face != NO_FACE:
             hits_inout.any_hit[p] = SECOND_INSIDE
     if face != NO_FACE:
@@ -101,29 +83,20 @@ def find_contained_kernel(
 
 @wp.kernel
 def report_contained_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    launched: wp.array(dtype=wp.int32),
-    hits: Hits,
-    contained: wp.array(dtype=wp.int32),
-    distances_out: Distances,
+    trees: Trees, batch: PairBatch, hits: Hits, contained: wp.array(dtype=wp.int32), distances_out: Distances
 ):
     """Report a corner and its face of the contained component of pairs that intersect in this way, a thread a pair."""
     p = wp.tid()
-    if p >= pair_count[0] or launched[0] == STALE:
+    if p >= batch.count[0] or batch.launched[0] == STALE:
         return
     which = hits.any_hit[p]
     if which < FIRST_INSIDE:
         return
     of_b = which == SECOND_INSIDE
-    owner = wp.where(of_b, wp.max(pairs[p][0], pairs[p][1]), wp.min(pairs[p][0], pairs[p][1]))
+    owner = wp.where(of_b, wp.max(batch.pairs[p][0], batch.pairs[p][1]), wp.min(batch.pairs[p][0], batch.pairs[p][1]))
     face = contained[p]
-    corner = states.face_corner[states.face_start[objects.state[owner]] + face]
-    x = load_vertex(models.vertex_pos, corner[0])
-    x = pose_point(objects.rotation[owner], objects.position[owner], x)
+    corner = trees.states.face_corner[trees.states.face_start[trees.objects.state[owner]] + face]
+    x = load_vertex(trees.models.vertex_pos, corner[0])
+    x = pose_point(trees.objects.rotation[owner], trees.objects.position[owner], x)
     face_a, face_b = wp.where(of_b, -1, face), wp.where(of_b, face, -1)
-    write_nearest(p, pair_poses[p].swapped, face_a, face_b, x, x, distances_out)
+    write_nearest(p, batch.poses[p].swapped, face_a, face_b, x, x, distances_out)

@@ -8,12 +8,12 @@ so that the deepest sample, the lowest of several, is found in any order.
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.boxes import round_up
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.lanes import warp_lane, warp_max, warp_min_item, warp_size, warp_sync
 from warp_abtree.kernels.base.nodes import Node, load_node
-from warp_abtree.kernels.base.poses import HALF, PairPose, pose_point
+from warp_abtree.kernels.base.poses import HALF, PairBatch, PairPose, pose_point
 from warp_abtree.kernels.distance.frame import SearchScale, make_scale, slack_of
 from warp_abtree.kernels.distance.report import Distances, blend_corners, write_nearest
 from warp_abtree.kernels.inside.components import Solids
@@ -50,8 +50,7 @@ wp.set_module_options(MODULE_OPTIONS)
 
 @wp.func
 def bound_depth(
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     inner: Solid,
     outer: Solid,
@@ -76,7 +75,7 @@ def bound_depth(
     if is_avoided(sampling, middle, reach):
         return none, hint
     # What is inside lies within the root's box, and no deeper than its nearest side.
-    root = load_node(states, outer.node + 1)
+    root = load_node(trees.states, outer.node + 1)
     x = into_frame(pose, outer, middle)
     if square_outside(root, x) > reach * reach:
         return none, hint
@@ -84,12 +83,12 @@ def bound_depth(
         side = wp.min(x[i] - wp.float64(root.lower[i]), wp.float64(root.upper[i]) - x[i])
         if side + reach < known:
             return none, hint
-    distance, near = nearest_face(models, states, pose, outer, middle, hint, known - reach)
+    distance, near = nearest_face(trees, pose, outer, middle, hint, known - reach)
     if distance + reach < known:
         return none, near
     if reach - distance < known or distance > reach:
         centre = wp.where(inner.of_b, outer.centre, inner.centre)
-        if not is_inside(models, states, pose, outer.of_b, centre, middle):
+        if not is_inside(trees, pose, outer.of_b, centre, middle):
             return none, near
     return distance + reach, near
 
@@ -105,14 +104,7 @@ def agree(best: Deepest):
 
 @wp.func
 def find_deepest_sample(
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    inner: Solid,
-    outer: Solid,
-    room: wp.int32,
-    known: Deepest,
-    sampling: Sampling,
+    trees: Trees, pose: PairPose, inner: Solid, outer: Solid, room: wp.int32, known: Deepest, sampling: Sampling
 ):
     """Return the deepest of a known sample and all samples of one object inside the other, the same in all lanes.
 
@@ -121,7 +113,7 @@ def find_deepest_sample(
     """
     best = known
     items = nearest_stack()
-    root = load_node(states, inner.node + 1)
+    root = load_node(trees.states, inner.node + 1)
     # A single face waits at once.
     waiting = wp.where(root.face >= 0, 1, 0)
     end = 1 - waiting
@@ -142,10 +134,10 @@ def find_deepest_sample(
             warp_sync()
             children, kinds, bounds = four_items(), wp.vec4i(), wp.vec4()
             for k in range(2):
-                child = load_node(states, inner.node + wp.where(live, 2 * node + k, 1))
+                child = load_node(trees.states, inner.node + wp.where(live, 2 * node + k, 1))
                 if live:
                     near = item_second(item)
-                    bound, near = bound_depth(models, states, pose, inner, outer, child, near, best.depth, sampling)
+                    bound, near = bound_depth(trees, pose, inner, outer, child, near, best.depth, sampling)
                     if bound >= wp.float64(0.0):
                         kinds[k] = wp.where(child.face >= 0, FACES, NODES)
                         children[k] = pack_item(wp.where(child.face >= 0, child.face, child.skip), near)
@@ -160,7 +152,7 @@ def find_deepest_sample(
             item = read_item(items, at)
             if warp_lane() < popped and wp.float64(-read_bound(items, at)) >= best.depth:
                 face, near = item_first(item), item_second(item)
-                best = measure_samples(models, states, pose, inner, outer, face, near, best, sampling)
+                best = measure_samples(trees, pose, inner, outer, face, near, best, sampling)
             warp_sync()
             best = agree(best)
     return best
@@ -168,8 +160,7 @@ def find_deepest_sample(
 
 @wp.func
 def deepest_of_both(
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     solids: Solids,
     first: Solid,
@@ -182,12 +173,12 @@ def deepest_of_both(
     """Return the deepest of a known sample and all samples of either object inside the other, where that is a solid."""
     best = known
     if solids.is_solid[wp.max(pair[0], pair[1])] != 0:
-        best = find_deepest_sample(models, states, pose, first, second, room, known, sampling)
+        best = find_deepest_sample(trees, pose, first, second, room, known, sampling)
     if solids.is_solid[wp.min(pair[0], pair[1])] != 0:
         other = Deepest()
         other.depth = best.depth
         other.item = KNOWN
-        other = find_deepest_sample(models, states, pose, second, first, room, other, sampling)
+        other = find_deepest_sample(trees, pose, second, first, room, other, sampling)
         if other.item != KNOWN:
             best = other
             best.of_b = True
@@ -195,42 +186,32 @@ def deepest_of_both(
 
 
 @wp.func
-def deepest_points(
-    models: ModelPool, states: StatePool, objects: ObjectPool, pose: PairPose, pair: wp.vec2i, best: Deepest
-):
+def deepest_points(trees: Trees, pose: PairPose, pair: wp.vec2i, best: Deepest):
     """Return the deepest sample of a pair and the point of the other's surface that is nearest: in A's frame, posed."""
     face = wp.int32(best.item >> wp.int64(33))
     weights = sample_weights(wp.int32((best.item >> wp.int64(30)) & wp.int64(7)))
     nearest = wp.int32(best.item & wp.int64(0x3FFFFFFF))
     a, b = wp.min(pair[0], pair[1]), wp.max(pair[0], pair[1])
     inner, outer = wp.where(best.of_b, b, a), wp.where(best.of_b, a, b)
-    u, v, w = load_posed_face(models, states, pose, best.of_b, face)
+    u, v, w = load_posed_face(trees, pose, best.of_b, face)
     point = (weights[0] * u + weights[1] * v) + weights[2] * w
-    u, v, w = load_posed_face(models, states, pose, not best.of_b, nearest)
+    u, v, w = load_posed_face(trees, pose, not best.of_b, nearest)
     near, _size = point_features(u, v, w, point)
-    ids = states.face_corner[states.face_start[objects.state[outer]] + nearest]
-    foot = blend_corners(models, ids, point_weights(near))
-    foot = pose_point(objects.rotation[outer], objects.position[outer], foot)
-    ids = states.face_corner[states.face_start[objects.state[inner]] + face]
-    sample = blend_corners(models, ids, weights)
-    sample = pose_point(objects.rotation[inner], objects.position[inner], sample)
+    ids = trees.states.face_corner[trees.states.face_start[trees.objects.state[outer]] + nearest]
+    foot = blend_corners(trees.models, ids, point_weights(near))
+    foot = pose_point(trees.objects.rotation[outer], trees.objects.position[outer], foot)
+    ids = trees.states.face_corner[trees.states.face_start[trees.objects.state[inner]] + face]
+    sample = blend_corners(trees.models, ids, weights)
+    sample = pose_point(trees.objects.rotation[inner], trees.objects.position[inner], sample)
     return point, sample, foot
 
 
 @wp.func
 def report_deepest(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pose: PairPose,
-    scaling: SearchScale,
-    pair: wp.vec2i,
-    best: Deepest,
-    p: wp.int32,
-    distances: Distances,
+    trees: Trees, pose: PairPose, scaling: SearchScale, pair: wp.vec2i, best: Deepest, p: wp.int32, distances: Distances
 ):
     """Write the deepest sample of a pair, the point of the other's surface that is nearest, and their faces."""
-    _point, sample, foot = deepest_points(models, states, objects, pose, pair, best)
+    _point, sample, foot = deepest_points(trees, pose, pair, best)
     face = wp.int32(best.item >> wp.int64(33))
     nearest = wp.int32(best.item & wp.int64(0x3FFFFFFF))
     d = best.depth
@@ -246,19 +227,11 @@ def report_deepest(
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
 def find_depth_kernel(
-    # static
     room: wp.int32,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     solids: Solids,
-    # state
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    launched: wp.array(dtype=wp.int32),
+    batch: PairBatch,
     hits: Hits,
-    # out
     distances_inout: Distances,
 ):
     """Find the depth of the object pairs that intersect and have samples of one in the other, a solid; a warp a pair.
@@ -266,21 +239,21 @@ def find_depth_kernel(
     Others keep the rows that they have.
     """
     p = wp.tid() / warp_size()
-    if p >= pair_count[0] or p >= pairs.shape[0] or launched[0] == STALE:
+    if p >= batch.count[0] or p >= batch.pairs.shape[0] or batch.launched[0] == STALE:
         return
     if hits.any_hit[p] == 0:
         return
-    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
+    a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
     if solids.is_solid[a] == 0 and solids.is_solid[b] == 0:
         return
-    pose = pair_poses[p]
-    scaling = make_scale(models, states, objects, pose, a, b)
-    first = make_solid(models, states, pose, scaling, False, objects.state[a])
-    second = make_solid(models, states, pose, scaling, True, objects.state[b])
+    pose = batch.poses[p]
+    scaling = make_scale(trees, pose, a, b)
+    first = make_solid(trees, pose, scaling, False, trees.objects.state[a])
+    second = make_solid(trees, pose, scaling, True, trees.objects.state[b])
     best = Deepest()
     best.item = KNOWN
     sampling = Sampling()
     sampling.samples = SAMPLES
-    best = deepest_of_both(models, states, pose, solids, first, second, pairs[p], room, best, sampling)
+    best = deepest_of_both(trees, pose, solids, first, second, batch.pairs[p], room, best, sampling)
     if best.item != KNOWN and warp_lane() == 0:
-        report_deepest(models, states, objects, pose, scaling, pairs[p], best, p, distances_inout)
+        report_deepest(trees, pose, scaling, batch.pairs[p], best, p, distances_inout)

@@ -8,11 +8,11 @@ places of the nearest other points where there is no room.
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.lanes import warp_lane, warp_size
 from warp_abtree.kernels.base.nodes import load_node
-from warp_abtree.kernels.base.poses import HALF, PairPose, pose_point
+from warp_abtree.kernels.base.poses import HALF, PairBatch, PairPose, pose_point
 from warp_abtree.kernels.contacts.manifold import Manifolds
 from warp_abtree.kernels.contacts.points import order_direction
 from warp_abtree.kernels.distance.frame import make_scale
@@ -60,29 +60,21 @@ def way_of_points(manifolds: Manifolds, p: wp.int32):
 
 
 @wp.func
-def way_of_middle(models: ModelPool, states: StatePool, pose: PairPose, inner: Solid, outer: Solid):
+def way_of_middle(trees: Trees, pose: PairPose, inner: Solid, outer: Solid):
     """Return the way out of the middle of the inner object's box, in A's frame."""
-    root = load_node(states, inner.node + 1)
+    root = load_node(trees.states, inner.node + 1)
     middle = HALF * (wp.vec3d(root.lower) + wp.vec3d(root.upper)) + inner.centre
     if inner.of_b:
         middle = pose_point(pose.rotation, pose.translation, middle)
-    _, face = nearest_face(models, states, pose, outer, middle, NO_NEAREST, wp.float64(0.0))
-    way = way_out(models, states, pose, outer, face, middle)
-    if not is_inside(models, states, pose, outer.of_b, wp.where(inner.of_b, outer.centre, inner.centre), middle):
+    _, face = nearest_face(trees, pose, outer, middle, NO_NEAREST, wp.float64(0.0))
+    way = way_out(trees, pose, outer, face, middle)
+    if not is_inside(trees, pose, outer.of_b, wp.where(inner.of_b, outer.centre, inner.centre), middle):
         way = -way
     return way
 
 
 @wp.func
-def way_of_second(
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    first: Solid,
-    second: Solid,
-    which: wp.int32,
-    normals: wp.vec3d,
-):
+def way_of_second(trees: Trees, pose: PairPose, first: Solid, second: Solid, which: wp.int32, normals: wp.vec3d):
     """Return the way on which B comes free, in A's frame.
 
     Args:
@@ -90,9 +82,9 @@ def way_of_second(
         normals: Sum of the normals of its points, in the order of the pair.
     """
     if which == FIRST_INSIDE:
-        return -way_of_middle(models, states, pose, first, second)
+        return -way_of_middle(trees, pose, first, second)
     if which == SECOND_INSIDE:
-        return way_of_middle(models, states, pose, second, first)
+        return way_of_middle(trees, pose, second, first)
     return wp.where(pose.swapped != 0, -normals, normals)
 
 
@@ -145,33 +137,25 @@ def insert_point(p: wp.int32, along: wp.vec3d, x: wp.vec3d, normal: wp.vec3d, de
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
 def add_inside_point_kernel(
-    # static
     room: wp.int32,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     solids: Solids,
-    # state
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    launched: wp.array(dtype=wp.int32),
+    batch: PairBatch,
     hits: Hits,
-    # out
     manifolds_inout: Manifolds,
 ):
     """Add points of what is inside to those of the pairs that intersect, of which one is a solid; a warp a pair."""
     p = wp.tid() / warp_size()
-    if p >= pair_count[0] or p >= pairs.shape[0] or launched[0] == STALE:
+    if p >= batch.count[0] or p >= batch.pairs.shape[0] or batch.launched[0] == STALE:
         return
-    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
+    a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
     if hits.any_hit[p] == 0 or (solids.is_solid[a] == 0 and solids.is_solid[b] == 0):
         return
-    pose = pair_poses[p]
-    scaling = make_scale(models, states, objects, pose, a, b)
-    first = make_solid(models, states, pose, scaling, False, objects.state[a])
-    second = make_solid(models, states, pose, scaling, True, objects.state[b])
-    size = wp.min(size_of(states, first), size_of(states, second))
+    pose = batch.poses[p]
+    scaling = make_scale(trees, pose, a, b)
+    first = make_solid(trees, pose, scaling, False, trees.objects.state[a])
+    second = make_solid(trees, pose, scaling, True, trees.objects.state[b])
+    size = wp.min(size_of(trees.states, first), size_of(trees.states, second))
     deep = known_depth(manifolds_inout, p)
     if manifolds_inout.count[p] > 0 and deep < DEPTH_STEP * size:
         return
@@ -181,18 +165,18 @@ def add_inside_point_kernel(
     most = manifolds_inout.point.shape[1]
     sampling.samples = 3
     sampling.radius = SAMPLE_SPACING * size
-    normals = wp.transpose(objects.rotation[a]) * way_of_points(manifolds_inout, p)
-    sampling.way = way_of_second(models, states, pose, first, second, hits.any_hit[p], normals)
-    along = order_direction(objects.rotation[a])
+    normals = wp.transpose(trees.objects.rotation[a]) * way_of_points(manifolds_inout, p)
+    sampling.way = way_of_second(trees, pose, first, second, hits.any_hit[p], normals)
+    along = order_direction(trees.objects.rotation[a])
     searching = bool(True)
     while searching:
         best = Deepest()
         best.item = KNOWN
         best.depth = least
-        best = deepest_of_both(models, states, pose, solids, first, second, pairs[p], room, best, sampling)
+        best = deepest_of_both(trees, pose, solids, first, second, batch.pairs[p], room, best, sampling)
         searching = best.item != KNOWN
         if searching:
-            point, sample, foot = deepest_points(models, states, objects, pose, pairs[p], best)
+            point, sample, foot = deepest_points(trees, pose, batch.pairs[p], best)
             if warp_lane() == 0:
                 # The way out of what is inside, of the higher object, or of the lower one turned.
                 normal = unit_vector(wp.where(best.of_b != (pose.swapped != 0), foot - sample, sample - foot))

@@ -7,7 +7,7 @@ of `PairPose` covers that, a rotation off orthonormal included, along each axis,
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.nodes import Node, load_node
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.distance.frame import SearchScale
@@ -35,12 +35,12 @@ class Solid:
 
 
 @wp.func
-def make_solid(models: ModelPool, states: StatePool, pose: PairPose, scaling: SearchScale, of_b: bool, state: wp.int32):
+def make_solid(trees: Trees, pose: PairPose, scaling: SearchScale, of_b: bool, state: wp.int32):
     """Return the `Solid` of A or B of a pair."""
     solid = Solid()
     solid.of_b = of_b
     solid.node = wp.where(of_b, pose.node_b, pose.node_a)
-    solid.centre = models.centre[states.model[state]]
+    solid.centre = trees.models.centre[trees.states.model[state]]
     solid.slack = scaling.pair_slack
     solid.margin = wp.float64(2.0) * wp.float64(pose.margin) + scaling.pair_slack
     solid.grow = wp.float64(scaling.grow)
@@ -103,23 +103,15 @@ def point_weights(near: Features):
 
 
 @wp.func
-def point_distance(models: ModelPool, states: StatePool, pose: PairPose, solid: Solid, face: wp.int32, point: wp.vec3d):
+def point_distance(trees: Trees, pose: PairPose, solid: Solid, face: wp.int32, point: wp.vec3d):
     """Return the distance of a point in A's frame from an active face of an object."""
-    a, b, c = load_posed_face(models, states, pose, solid.of_b, face)
+    a, b, c = load_posed_face(trees, pose, solid.of_b, face)
     near, size = point_features(a, b, c, point)
     return wp.sqrt(near.square) * size
 
 
 @wp.func
-def nearest_face(
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    solid: Solid,
-    point: wp.vec3d,
-    hint: wp.int32,
-    enough: wp.float64,
-):
+def nearest_face(trees: Trees, pose: PairPose, solid: Solid, point: wp.vec3d, hint: wp.int32, enough: wp.float64):
     """Return the least distance of a point from the faces of an object, and the lowest face that has it.
 
     Args:
@@ -130,7 +122,7 @@ def nearest_face(
     x = into_frame(pose, solid, point)
     least, face = wp.float64(wp.inf), wp.int32(hint)
     if hint != NO_NEAREST:
-        least = point_distance(models, states, pose, solid, hint, point)
+        least = point_distance(trees, pose, solid, hint, point)
         if least < enough:
             return least, face
     limit = (least + solid.margin) * solid.grow
@@ -138,17 +130,17 @@ def nearest_face(
     stack = wp.zeros(shape=(STACK_ROOM,), dtype=wp.int32)
     bound = wp.zeros(shape=(STACK_ROOM,), dtype=wp.float64)
     stack[0] = 1
-    bound[0] = square_outside(load_node(states, solid.node + 1), x)
+    bound[0] = square_outside(load_node(trees.states, solid.node + 1), x)
     end = wp.int32(1)
     while end > 0:
         end -= 1
         # Infinite where nothing is active.
         live = bound[end] <= limit and bound[end] < wp.float64(wp.inf)
-        node = load_node(states, solid.node + stack[end])
+        node = load_node(trees.states, solid.node + stack[end])
         if live and node.face < 0:
             first = 2 * node.skip
-            d0 = square_outside(load_node(states, solid.node + first), x)
-            d1 = square_outside(load_node(states, solid.node + first + 1), x)
+            d0 = square_outside(load_node(trees.states, solid.node + first), x)
+            d1 = square_outside(load_node(trees.states, solid.node + first + 1), x)
             # The nearer one on top.
             turn = wp.where(d0 < d1, 1, 0)
             stack[end] = first + turn
@@ -157,7 +149,7 @@ def nearest_face(
             bound[end + 1] = wp.min(d0, d1)
             end += 2
         elif live:
-            d = point_distance(models, states, pose, solid, node.face, point)
+            d = point_distance(trees, pose, solid, node.face, point)
             if d < least or (d == least and node.face < face):
                 face = node.face
                 if d < least:

@@ -12,7 +12,7 @@ Source of the perturbation: Edelsbrunner and Muecke 1990, Simulation of simplici
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool, load_vertex
+from warp_abtree.kernels.base.arrays import StatePool, Trees, load_vertex
 from warp_abtree.kernels.base.boxes import pose_box
 from warp_abtree.kernels.base.nodes import Node, load_node
 from warp_abtree.kernels.base.poses import PairPose, pose_point
@@ -127,12 +127,12 @@ def make_ray(pose: PairPose, of_b: bool, states: StatePool, centre: wp.vec3d, po
 
 
 @wp.func
-def load_posed_face(models: ModelPool, states: StatePool, pose: PairPose, of_b: bool, face: wp.int32):
+def load_posed_face(trees: Trees, pose: PairPose, of_b: bool, face: wp.int32):
     """Return the corners of an active face of A or of B in A's frame."""
-    c = states.face_corner[wp.where(of_b, pose.corner_b, pose.corner_a) + face]
-    p = load_vertex(models.vertex_pos, c[0])
-    q = load_vertex(models.vertex_pos, c[1])
-    r = load_vertex(models.vertex_pos, c[2])
+    c = trees.states.face_corner[wp.where(of_b, pose.corner_b, pose.corner_a) + face]
+    p = load_vertex(trees.models.vertex_pos, c[0])
+    q = load_vertex(trees.models.vertex_pos, c[1])
+    r = load_vertex(trees.models.vertex_pos, c[2])
     if of_b:
         p = pose_point(pose.rotation, pose.translation, p)
         q = pose_point(pose.rotation, pose.translation, q)
@@ -141,30 +141,30 @@ def load_posed_face(models: ModelPool, states: StatePool, pose: PairPose, of_b: 
 
 
 @wp.func
-def is_inside(models: ModelPool, states: StatePool, pose: PairPose, of_b: bool, centre: wp.vec3d, point: wp.vec3d):
+def is_inside(trees: Trees, pose: PairPose, of_b: bool, centre: wp.vec3d, point: wp.vec3d):
     """Return whether a point in A's frame, off the surface, is inside the closed surface of A, or of B.
 
     Args:
         centre: Of A's model.
     """
-    ray = make_ray(pose, of_b, states, centre, point)
+    ray = make_ray(pose, of_b, trees.states, centre, point)
     start = wp.where(of_b, pose.node_b, pose.node_a)
     stack = wp.zeros(shape=(STACK_ROOM,), dtype=wp.int32)
     crossings = wp.int32(0)
     end = wp.int32(0)
-    if meets_node(pose, of_b, load_node(states, start + 1), ray):
+    if meets_node(pose, of_b, load_node(trees.states, start + 1), ray):
         stack[0] = 1
         end = 1
     while end > 0:
         end -= 1
-        node = load_node(states, start + stack[end])
+        node = load_node(trees.states, start + stack[end])
         if node.face >= 0:
-            a, b, c = load_posed_face(models, states, pose, of_b, node.face)
+            a, b, c = load_posed_face(trees, pose, of_b, node.face)
             crossings += crosses_face(ray, a, b, c)
         else:
             for k in range(2):
                 child = 2 * node.skip + k
-                if meets_node(pose, of_b, load_node(states, start + child), ray):
+                if meets_node(pose, of_b, load_node(trees.states, start + child), ray):
                     stack[end] = child
                     end += 1
     return (crossings & 1) != 0

@@ -6,7 +6,7 @@ distance from the surface.
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import HALF, PairPose
 from warp_abtree.kernels.inside.nearest_face import (
@@ -91,9 +91,9 @@ def sample_weights(sample: wp.int32):
 
 
 @wp.func
-def way_out(models: ModelPool, states: StatePool, pose: PairPose, outer: Solid, face: wp.int32, point: wp.vec3d):
+def way_out(trees: Trees, pose: PairPose, outer: Solid, face: wp.int32, point: wp.vec3d):
     """Return the way from a point to the nearest one of a face of an object, in A's frame."""
-    a, b, c = load_posed_face(models, states, pose, outer.of_b, face)
+    a, b, c = load_posed_face(trees, pose, outer.of_b, face)
     near, _size = point_features(a, b, c, point)
     w = point_weights(near)
     return w[0] * (a - point) + w[1] * (b - point) + w[2] * (c - point)
@@ -101,8 +101,7 @@ def way_out(models: ModelPool, states: StatePool, pose: PairPose, outer: Solid, 
 
 @wp.func
 def measure_samples(
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     inner: Solid,
     outer: Solid,
@@ -113,9 +112,9 @@ def measure_samples(
 ):
     """Return the deepest of a known sample and the samples of a face that are inside the outer object."""
     best = known
-    a, b, c = load_posed_face(models, states, pose, inner.of_b, face)
+    a, b, c = load_posed_face(trees, pose, inner.of_b, face)
     centre = wp.where(inner.of_b, outer.centre, inner.centre)
-    root = load_node(states, outer.node + 1)
+    root = load_node(trees.states, outer.node + 1)
     near = wp.int32(hint)
     k = wp.int32(0)
     while k < sampling.samples:
@@ -125,13 +124,13 @@ def measure_samples(
         if met and not is_avoided(sampling, point, wp.float64(0.0)):
             hopeful = bool(True)
             if near != NO_NEAREST:
-                hopeful = point_distance(models, states, pose, outer, near, point) >= best.depth
-            if hopeful and is_inside(models, states, pose, outer.of_b, centre, point):
-                distance, near = nearest_face(models, states, pose, outer, point, near, best.depth)
+                hopeful = point_distance(trees, pose, outer, near, point) >= best.depth
+            if hopeful and is_inside(trees, pose, outer.of_b, centre, point):
+                distance, near = nearest_face(trees, pose, outer, point, near, best.depth)
                 if distance >= best.depth and distance > wp.float64(0.0):
                     item = pack_deepest(face, k, near)
                     if distance > best.depth or item < best.item:
-                        way = way_out(models, states, pose, outer, near, point)
+                        way = way_out(trees, pose, outer, near, point)
                         if wp.dot(way, wp.where(inner.of_b, sampling.way, -sampling.way)) >= wp.float64(0.0):
                             best.depth = distance
                             best.item = item

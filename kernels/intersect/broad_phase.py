@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import LAST_KEY, ModelPool, ObjectPool, StatePool, pair_key
+from warp_abtree.kernels.base.arrays import LAST_KEY, ObjectPool, Trees, pair_key
 from warp_abtree.kernels.base.boxes import round_down, round_up
 from warp_abtree.kernels.base.generation import LaunchRecord, is_stale
 from warp_abtree.kernels.base.nodes import load_node
@@ -16,9 +16,7 @@ REACH_ROUNDING = wp.constant(wp.float64(1.0 + 2.0**-48))
 
 @wp.kernel
 def pose_box_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
+    trees: Trees,
     record: LaunchRecord,
     wide: wp.float64,
     reach: wp.array(dtype=wp.vec4d),
@@ -33,13 +31,13 @@ def pose_box_kernel(
             for none.
     """
     i = wp.tid()
-    state = objects.state[i]
-    root = load_node(states, states.node_start[state] + 1)
+    state = trees.objects.state[i]
+    root = load_node(trees.states, trees.states.node_start[state] + 1)
     lower = wp.vec3d(root.lower)
     upper = wp.vec3d(root.upper)
-    rotation = objects.rotation[i]
-    position = objects.position[i]
-    middle = models.centre[states.model[state]] + wp.float64(0.5) * (lower + upper)
+    rotation = trees.objects.rotation[i]
+    position = trees.objects.position[i]
+    middle = trees.models.centre[trees.states.model[state]] + wp.float64(0.5) * (lower + upper)
     half = wp.float64(0.5) * (upper - lower)
     box_lower = wp.vec3()
     box_upper = wp.vec3()

@@ -8,7 +8,7 @@ that node pair tests are the same in every launch.
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY
 
@@ -156,15 +156,13 @@ def start_descent(output: wp.int32, plain_tests: wp.int64, repeats: wp.int32, be
 
 
 @wp.func
-def should_build_slabs(
-    models: ModelPool, states: StatePool, pose: PairPose, hit_count: wp.int64, tested: wp.int64, before: Descent
-):
+def should_build_slabs(trees: Trees, pose: PairPose, hit_count: wp.int64, tested: wp.int64, before: Descent):
     """Return whether to build slabs now, and the descent with the number of tests after which to ask again."""
     descent = before
     if tested >= descent.plain_tests and hit_count * NODE_TESTS_A_HIT <= tested:
         return True, descent
     if descent.cost < wp.int64(0):
-        descent.cost = slab_cost(models, states, pose, descent.repeats)
+        descent.cost = slab_cost(trees.models, trees.states, pose, descent.repeats)
     if tested >= descent.cost and hit_count * NODE_TESTS_A_DENSE_HIT <= tested:
         return True, descent
     descent.looks = tested * wp.int64(2)
@@ -177,8 +175,7 @@ def should_build_slabs(
 
 @wp.func
 def advance(
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     hit_count: wp.int64,
     tested: wp.int64,
@@ -194,9 +191,9 @@ def advance(
     """
     descent = before
     if descent.top > 0 and tested >= descent.looks:
-        wanted, descent = should_build_slabs(models, states, pose, hit_count, tested, descent)
+        wanted, descent = should_build_slabs(trees, pose, hit_count, tested, descent)
         if wanted:
-            descent.floors = open_subtrees(models, states, pose, descent.thread, memory)
+            descent.floors = open_subtrees(trees.models, trees.states, pose, descent.thread, memory)
             descent.looks = NEVER
     plain = descent.floors[0] == NO_FLOOR
     if not plain and descent.deep == 0:
@@ -206,12 +203,12 @@ def advance(
     progress = three_numbers()
     if descent.deep > 0:
         progress = descend_subtrees(
-            models, states, pose, descent.thread, descent.ready, descent.deep, below, memory, faces
+            trees.models, trees.states, pose, descent.thread, descent.ready, descent.deep, below, memory, faces
         )
         descent.deep = wp.int32(progress[0])
     else:
         most = wp.where(plain, descent.looks - tested, wp.int64(1))
-        progress = descend(states, pose, descent.at_once, descent.ready, most, descent.top, stack, faces)
+        progress = descend(trees.states, pose, descent.at_once, descent.ready, most, descent.top, stack, faces)
         descent.top = wp.int32(progress[0])
     return descent, wp.int32(progress[1]), progress[2]
 

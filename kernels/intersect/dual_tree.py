@@ -8,10 +8,10 @@ import functools
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.counters import add_warp_sum
 from warp_abtree.kernels.base.lanes import WARP_SIZE, hold_uniform, warp_any, warp_lane, warp_size, warp_sync
-from warp_abtree.kernels.base.poses import NO_NODE, PairPose
+from warp_abtree.kernels.base.poses import NO_NODE, PairBatch, PairPose
 from warp_abtree.kernels.exact.predicates import EXACT
 from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, Hits
 from warp_abtree.kernels.intersect.leaf_pairs import separate_leaf_pairs, test_straddling
@@ -103,18 +103,12 @@ def expand_items(
 
 @wp.func
 def separate_slab_pairs(
-    items: wp.uint64,
-    first: wp.int32,
-    popped: wp.int32,
-    end: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
+    items: wp.uint64, first: wp.int32, popped: wp.int32, end: wp.int32, trees: Trees, pose: PairPose
 ):
     """Put the slab pairs on the stack that slabs do not separate, one a lane; return its new end."""
     lane = warp_lane()
     item = read_item(items, SLAB_PAIR_START + first + wp.min(lane, popped - 1))
-    overlap = slabs_overlap(models, states, pose, item)
+    overlap = slabs_overlap(trees, pose, item)
     end = push_items(items, end, overlap and lane < popped, item)
     warp_sync()
     return end
@@ -143,8 +137,7 @@ def descend_warp(
     head: wp.int32,
     ends: wp.vec3i,
     floor: wp.vec2i,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
 ):
     """Test node pairs for a turn, or until enough slab pairs or leaf pairs wait, and then a warp of slab pairs.
@@ -160,7 +153,9 @@ def descend_warp(
         ready_slab = wp.min(ready, wp.max(1, room - 3))
         popped = wp.min(wp.max(1, room >> 2), wp.min(warp_size(), end - head))
         end -= popped
-        found, compared = expand_items(items, end, popped, wp.vec3i(end, slab_pairs, waiting), floor, states, pose)
+        found, compared = expand_items(
+            items, end, popped, wp.vec3i(end, slab_pairs, waiting), floor, trees.states, pose
+        )
         end = found[0]
         slab_pairs = found[1]
         waiting = found[2]
@@ -169,24 +164,20 @@ def descend_warp(
     if slab_pairs >= ready_slab or (end == head and slab_pairs > 0):
         popped = wp.min(slab_pairs, warp_size())
         slab_pairs -= popped
-        end = separate_slab_pairs(items, slab_pairs, popped, end, models, states, pose)
+        end = separate_slab_pairs(items, slab_pairs, popped, end, trees, pose)
         node_tests += wp.where(warp_lane() < popped, 1, 0)
     return wp.vec3i(end, slab_pairs, waiting), node_tests
 
 
 @wp.func
 def traverse_items(
-    # static
     output: wp.int32,
     mode: wp.int32,
     pace: Pace,
     pair: wp.int32,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
-    # state
     own: WarpItems,
-    # out
     hits: Hits,
     work: Work,
 ):
@@ -207,7 +198,7 @@ def traverse_items(
         if turn == LONG_SEARCH and for_any:
             ready = warp_size()
             floor = pose.floor
-        ends, compared = descend_warp(items, pace, ready, head, ends, floor, models, states, pose)
+        ends, compared = descend_warp(items, pace, ready, head, ends, floor, trees, pose)
         node_tests += compared
         waiting = ends[2]
         empty = ends[0] == head and ends[1] == 0
@@ -215,14 +206,12 @@ def traverse_items(
             popped = wp.min(waiting, warp_size())
             waiting -= popped
             ends[2] = waiting
-            straddling = separate_leaf_pairs(mode, items, waiting, popped, straddling, models, states, pose)
+            straddling = separate_leaf_pairs(mode, items, waiting, popped, straddling, trees, pose)
             tested += popped
         if straddling >= ready_straddling or (empty and waiting == 0 and straddling > 0):
             popped = wp.min(straddling, warp_size())
             straddling -= popped
-            found, uncertain = test_straddling(
-                output, mode, items, straddling, popped, pair, models, states, pose, hits
-            )
+            found, uncertain = test_straddling(output, mode, items, straddling, popped, pair, trees, pose, hits)
             hit_count += wp.where(found, 1, 0)
             uncertain_count += wp.where(uncertain, 1, 0)
         idle = count_idle(tickets)
@@ -272,17 +261,10 @@ def warp_traversal(mode: int, for_any: bool):
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=128)
     def traverse_warp_kernel(
-        stack_room: wp.int32,
-        output: wp.int32,
-        models: ModelPool,
-        states: StatePool,
-        pair_count: wp.array(dtype=wp.int32),
-        pair_poses: wp.array(dtype=PairPose),
-        hits_inout: Hits,
-        work_inout: Work,
+        stack_room: wp.int32, output: wp.int32, trees: Trees, batch: PairBatch, hits_inout: Hits, work_inout: Work
     ):
         """Traverse units of work, each a part of one object pair, and donated items, until there are none."""
-        count = wp.min(pair_count[0], pair_poses.shape[0])
+        count = wp.min(batch.count[0], batch.poses.shape[0])
         ended = first_ended(wp.static(mode != int(EXACT)), work_inout.counter)
         unit = first_unit(work_inout.counter)
         parts = units_of_pair(ended, count, work_inout)
@@ -301,19 +283,19 @@ def warp_traversal(mode: int, for_any: bool):
                 p = work_inout.owner[slot][0]
             task = wp.vec3i(p, unit - p * parts, parts)
             unit = claim_ahead(ended, unit, units, work_inout)
-            pose = pair_poses[p]
+            pose = batch.poses[p]
             lists = SmallLists()
             if wp.static(mode == int(EXACT)):
                 if slot < 0 and is_small(pose, work_inout.small_faces):
                     task[2] = parts_at_once(parts, count, work_inout.warps)
-                    lists = gather_leaves(task, own.items, states, pose)
+                    lists = gather_leaves(task, own.items, trees.states, pose)
             if lists.fits:
-                test_small_trees(asked, pace.for_any, task, lists, models, states, pose, own.items, hits_inout)
+                test_small_trees(asked, pace.for_any, task, lists, trees, pose, own.items, hits_inout)
             else:
                 pose.floor = slab_floor(pose, parts)
                 own.end = first_items(own.items, slot, task, pose, work_inout)
                 node_tests, tests = traverse_items(
-                    asked, wp.static(mode), pace, p, models, states, pose, own, hits_inout, work_inout
+                    asked, wp.static(mode), pace, p, trees, pose, own, hits_inout, work_inout
                 )
                 count_tests(hits_inout, p, node_tests, tests)
             ended += 1

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, Trees
 from warp_abtree.kernels.base.boxes import map_point
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.exact.predicates import FLOAT32, UNCERTAIN
@@ -81,22 +81,23 @@ def scaled_gap(pose: PairPose):
 
 
 @wp.func
-def face_plane_signs(
-    mode: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    face_a: wp.int32,
-    face_b: wp.int32,
-):
+def face_plane_signs(mode: wp.int32, trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
     """Return SEPARATED where the plane of one of two active faces separates them in float32, else the signs."""
     if mode == WITHIN or (mode != FLOAT32 and pose.error == wp.inf):
         return 0
-    a = load_corner_ids(states, pose.corner_a + face_a)
-    b = load_corner_ids(states, pose.corner_b + face_b)
+    a = load_corner_ids(trees.states, pose.corner_a + face_a)
+    b = load_corner_ids(trees.states, pose.corner_b + face_b)
     error, unit = float32_bounds(mode, pose)
-    a0, a1, a2 = near_of_a(models, pose, a[0]), near_of_a(models, pose, a[1]), near_of_a(models, pose, a[2])
-    b0, b1, b2 = near_of_b(models, pose, b[0]), near_of_b(models, pose, b[1]), near_of_b(models, pose, b[2])
+    a0, a1, a2 = (
+        near_of_a(trees.models, pose, a[0]),
+        near_of_a(trees.models, pose, a[1]),
+        near_of_a(trees.models, pose, a[2]),
+    )
+    b0, b1, b2 = (
+        near_of_b(trees.models, pose, b[0]),
+        near_of_b(trees.models, pose, b[1]),
+        near_of_b(trees.models, pose, b[2]),
+    )
     if mode == GAP:
         return gap_signs(error, unit, scaled_gap(pose), a0, a1, a2, b0, b1, b2)
     return plane_signs(error, unit, a0, a1, a2, b0, b1, b2)
@@ -104,13 +105,7 @@ def face_plane_signs(
 
 @wp.func
 def intersect_straddling_faces(
-    mode: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    face_a: wp.int32,
-    face_b: wp.int32,
-    signs: wp.int32,
+    mode: wp.int32, trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.int32, signs: wp.int32
 ):
     """Test straddling faces in float32, with the signs of `face_plane_signs`; return 1, 0 or UNCERTAIN."""
     error, unit = float32_bounds(mode, pose)
@@ -118,34 +113,27 @@ def intersect_straddling_faces(
         return 0
     if are_uncertain(unit, signs):
         return UNCERTAIN
-    a = load_corner_ids(states, pose.corner_a + face_a)
-    b = load_corner_ids(states, pose.corner_b + face_b)
+    a = load_corner_ids(trees.states, pose.corner_a + face_a)
+    b = load_corner_ids(trees.states, pose.corner_b + face_b)
     p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a[0], a[1], a[2], b[0], b[1], b[2])
     return intersect_straddling(
         error,
         unit,
-        near_of_a(models, pose, p1),
-        near_of_a(models, pose, q1),
-        near_of_a(models, pose, r1),
-        near_of_b(models, pose, p2),
-        near_of_b(models, pose, q2),
-        near_of_b(models, pose, r2),
+        near_of_a(trees.models, pose, p1),
+        near_of_a(trees.models, pose, q1),
+        near_of_a(trees.models, pose, r1),
+        near_of_b(trees.models, pose, p2),
+        near_of_b(trees.models, pose, q2),
+        near_of_b(trees.models, pose, r2),
     )
 
 
 @wp.func
-def test_faces(
-    mode: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    face_a: wp.int32,
-    face_b: wp.int32,
-):
+def test_faces(mode: wp.int32, trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
     """Test one active face of A against one of B in float64, in A's frame; return 1, 0 or UNCERTAIN."""
-    a = states.face_corner[pose.corner_a + face_a]
-    b = states.face_corner[pose.corner_b + face_b]
-    a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
+    a = trees.states.face_corner[pose.corner_a + face_a]
+    b = trees.states.face_corner[pose.corner_b + face_b]
+    a0, a1, a2, b0, b1, b2 = load_face_pair(trees.models, pose, a, b)
     if mode == FLOAT32:
         # A power of two brings the model to unit size, so that no product leaves float32's range.
         s = pose.scale
@@ -154,28 +142,22 @@ def test_faces(
 
 
 @wp.func
-def faces_near(models: ModelPool, states: StatePool, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
+def faces_near(trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
     """Return 1 unless the faces are proved farther apart than `within`, in float64; then 0."""
-    a = states.face_corner[pose.corner_a + face_a]
-    b = states.face_corner[pose.corner_b + face_b]
-    a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
+    a = trees.states.face_corner[pose.corner_a + face_a]
+    b = trees.states.face_corner[pose.corner_b + face_b]
+    a0, a1, a2, b0, b1, b2 = load_face_pair(trees.models, pose, a, b)
     return triangles_near(pose.within, a0, a1, a2, b0, b1, b2)
 
 
 @wp.func
 def try_straddling_faces(
-    mode: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    face_a: wp.int32,
-    face_b: wp.int32,
-    signs: wp.int32,
+    mode: wp.int32, trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.int32, signs: wp.int32
 ):
     """Return whether straddling faces meet in the first stage: 1, 0 or UNCERTAIN; for WITHIN, in all stages."""
     if mode == WITHIN:
-        return faces_near(models, states, pose, face_a, face_b)
-    return intersect_straddling_faces(mode, models, states, pose, face_a, face_b, signs)
+        return faces_near(trees, pose, face_a, face_b)
+    return intersect_straddling_faces(mode, trees, pose, face_a, face_b, signs)
 
 
 @wp.func

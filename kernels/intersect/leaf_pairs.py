@@ -6,7 +6,7 @@ here together.
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.counters import reserve_slot
 from warp_abtree.kernels.base.lanes import warp_lane, warp_sync
 from warp_abtree.kernels.base.poses import PairPose
@@ -35,14 +35,13 @@ def separate_leaf_pairs(
     first: wp.int32,
     popped: wp.int32,
     straddling: wp.int32,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
 ):
     """Drop the leaf pairs that a plane separates, one a lane; return how many straddling pairs wait then."""
     lane = warp_lane()
     item = read_item(items, STACK_LENGTH + first + wp.min(lane, popped - 1))
-    signs = face_plane_signs(mode, models, states, pose, item_first(item), item_second(item))
+    signs = face_plane_signs(mode, trees, pose, item_first(item), item_second(item))
     signs = wp.where(lane < popped, signs, SEPARATED)
     straddling = push_straddling(items, straddling, signs != SEPARATED, item, signs)
     warp_sync()
@@ -57,8 +56,7 @@ def test_straddling(
     first: wp.int32,
     popped: wp.int32,
     pair: wp.int32,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     hits: Hits,
 ):
@@ -70,7 +68,7 @@ def test_straddling(
     at = first + wp.min(lane, popped - 1)
     item = read_item(items, STRADDLING_START + at)
     signs = read_signs(items, at)
-    meet = try_straddling_faces(mode, models, states, pose, item_first(item), item_second(item), signs)
+    meet = try_straddling_faces(mode, trees, pose, item_first(item), item_second(item), signs)
     if mode == GAP:
         apart = meet == 0 and lane < popped
         slot = reserve_slot(hits.apart_total, apart)

@@ -7,11 +7,11 @@ by what `triangle_distance` errs by. So what is found depends on its bits alone,
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
 from warp_abtree.kernels.base.boxes import ROUNDING_UP
 from warp_abtree.kernels.base.counters import count_flags, reserve_slot, take_slots
 from warp_abtree.kernels.base.lanes import warp_lane, warp_size, warp_sync
-from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.exact.predicates import EXACT
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits, report_hit, test_faces
 from warp_abtree.kernels.search.item import item_first, item_second
@@ -33,15 +33,14 @@ def simd_near_filter(
 
 
 @wp.func
-def are_near(models: ModelPool, states: StatePool, pose: PairPose, gap: wp.float64, face_a: wp.int32, face_b: wp.int32):
+def are_near(trees: Trees, pose: PairPose, gap: wp.float64, face_a: wp.int32, face_b: wp.int32):
     """Return whether two faces that do not intersect are nearer than a gap, in A's frame."""
-    return triangle_distance(load_triangles(models, states, pose, face_a, face_b)) < gap
+    return triangle_distance(load_triangles(trees, pose, face_a, face_b)) < gap
 
 
 @wp.func
 def part_uncertain(
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     met: wp.int32,
     count: wp.int32,
@@ -53,7 +52,7 @@ def part_uncertain(
     """Decide uncertain face pairs by exact signs, and add each to those that have met or to those that are apart."""
     for i in range(count):
         item = uncertain[i]
-        if test_faces(EXACT, models, states, pose, item_first(item), item_second(item)) == 1:
+        if test_faces(EXACT, trees, pose, item_first(item), item_second(item)) == 1:
             met_inout[met] = item
             met += 1
         else:
@@ -64,20 +63,14 @@ def part_uncertain(
 
 @wp.func(inline=False)
 def report_near(
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    pair: wp.int32,
-    waiting: wp.int32,
-    apart: wp.array(dtype=wp.int64),
-    hits: Hits,
+    trees: Trees, pose: PairPose, pair: wp.int32, waiting: wp.int32, apart: wp.array(dtype=wp.int64), hits: Hits
 ):
     """Report the face pairs of a list that are nearer than the gap; return how many. For threads of the CPU."""
-    left = simd_near_filter(models, states, pose, waiting, apart)
+    left = simd_near_filter(trees.models, trees.states, pose, waiting, apart)
     near = wp.int32(0)
     for i in range(left):
         item = apart[i]
-        if are_near(models, states, pose, hits.gap[pair], item_first(item), item_second(item)):
+        if are_near(trees, pose, hits.gap[pair], item_first(item), item_second(item)):
             apart[near] = item
             near += 1
     slot = take_slots(hits.total, near)
@@ -87,33 +80,27 @@ def report_near(
 
 
 @wp.func
-def may_be_near(models: ModelPool, states: StatePool, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
+def may_be_near(trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
     """Return False only where float32 proves two faces farther apart than `within`, as `simd_near_filter`."""
     scale, gap = wp.float32(pose.scale), wp.float32(pose.within * pose.scale)
     # Beyond these numbers float32 has no squares, or no bounds.
     if not (pose.error < ERROR_MAX and gap < NEAR_GAP_MAX):
         return True
-    a, b = load_points(models, states, pose, pose.translation32 * scale, scale, face_a, face_b)
+    a, b = load_points(trees, pose, pose.translation32 * scale, scale, face_a, face_b)
     # Differences of corners err by `error` along an axis.
     return not (bound_faces(2.0 * pose.error, a, b)[0] > gap * ROUNDING_UP)
 
 
 @wp.func
 def report_waiting(
-    list: wp.uint64,
-    first: wp.int32,
-    popped: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pair_poses: wp.array(dtype=PairPose),
-    hits: Hits,
+    list: wp.uint64, first: wp.int32, popped: wp.int32, trees: Trees, pair_poses: wp.array(dtype=PairPose), hits: Hits
 ):
     """Report which of the face pairs that wait are nearer than the gap, one a lane."""
     item = read_signed_pair(list, first + wp.min(warp_lane(), popped - 1))
     p = item[0]
     near = warp_lane() < popped
     if near:
-        near = are_near(models, states, pair_poses[p], hits.gap[p], item[1], item[2])
+        near = are_near(trees, pair_poses[p], hits.gap[p], item[1], item[2])
     warp_sync()
     count_flags(hits.count, p, near)
     slot = reserve_slot(hits.total, near)
@@ -122,13 +109,7 @@ def report_waiting(
 
 
 @wp.kernel(module="unique", module_options={"enable_backward": False, "fuse_fp": False}, cuda_max_registers=128)
-def find_near_kernel(
-    threads: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pair_poses: wp.array(dtype=PairPose),
-    hits_inout: Hits,
-):
+def find_near_kernel(threads: wp.int32, trees: Trees, batch: PairBatch, hits_inout: Hits):
     """Report the face pairs that are apart and nearer than the gap, in a grid-stride loop; a block is a warp.
 
     Float32 drops most; those it leaves wait for float64 until a warp of them does.
@@ -141,26 +122,21 @@ def find_near_kernel(
             item = hits_inout.apart[wp.min(first + warp_lane(), end - 1)]
             kept = first + warp_lane() < end
             if kept:
-                kept = may_be_near(models, states, pair_poses[item[0]], item[1], item[2])
+                kept = may_be_near(trees, batch.poses[item[0]], item[1], item[2])
             waiting = push_signed_pair(list, waiting, kept, item, 0)
             warp_sync()
             first += wp.min(threads, end - first)
         if waiting >= warp_size() or (first >= end and waiting > 0):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
-            report_waiting(list, waiting, popped, models, states, pair_poses, hits_inout)
+            report_waiting(list, waiting, popped, trees, batch.poses, hits_inout)
 
 
 @wp.kernel
-def add_reach_kernel(
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    reach: wp.array(dtype=wp.vec4d),
-    gap_out: wp.array(dtype=wp.float64),
-):
+def add_reach_kernel(batch: PairBatch, reach: wp.array(dtype=wp.vec4d), gap_out: wp.array(dtype=wp.float64)):
     """Find the gap of one pair a thread, of the motion and the reach of both objects."""
     p = wp.tid()
-    if p < pair_count[0]:
-        a, b = reach[pairs[p][0]], reach[pairs[p][1]]
+    if p < batch.count[0]:
+        a, b = reach[batch.pairs[p][0]], reach[batch.pairs[p][1]]
         motion = wp.vec3d(a[0] - b[0], a[1] - b[1], a[2] - b[2])
         gap_out[p] = (a[3] + b[3]) + wp.length(motion)

@@ -4,10 +4,10 @@ import functools
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.generation import record_launch
 from warp_abtree.kernels.base.lanes import WARP_SIZE
-from warp_abtree.kernels.base.poses import PairPose, pair_pose
+from warp_abtree.kernels.base.poses import PairBatch, pair_pose
 from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, Hits
 from warp_abtree.kernels.intersect.small_trees import is_small
 from warp_abtree.kernels.search.load_balance import NO_UNIT, Work, note_descent, units_per_pair
@@ -44,14 +44,12 @@ def clear_hits(p: wp.int32, hits: Hits):
 
 
 @wp.struct
-class Started:
-    """The object pairs of the threads of the CPU: one thread starts them, alone or before others are there."""
+class ThreadSteps:
+    """What a launch of threads does: one thread starts all pairs, alone or before others are there."""
 
-    pair_count: wp.array(dtype=wp.int32)  # shape (1,)
-    pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]; [0] where they are started
     within: wp.array(dtype=wp.float64)  # as for `relative_pose_kernel`
-    pair_poses: wp.array(dtype=PairPose)  # shape [pair]
-    only: wp.bool  # whether nothing is traversed
+    starts: wp.bool  # whether pairs are started
+    traverses: wp.bool  # whether they are traversed
 
 
 @functools.cache
@@ -60,23 +58,15 @@ def pose_starter(with_distances: bool):
 
     @wp.func
     def start_pose(
-        p: wp.int32,
-        output: wp.int32,
-        models: ModelPool,
-        states: StatePool,
-        objects: ObjectPool,
-        pairs: wp.array(dtype=wp.vec2i),
-        within: wp.array(dtype=wp.float64),
-        pair_poses: wp.array(dtype=PairPose),
-        work: Work,
+        p: wp.int32, output: wp.int32, trees: Trees, batch: PairBatch, within: wp.array(dtype=wp.float64), work: Work
     ):
         """Compute the pose of B in A's frame, A the smaller index."""
-        a = wp.min(pairs[p][0], pairs[p][1])
-        b = wp.max(pairs[p][0], pairs[p][1])
+        a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
+        b = wp.max(batch.pairs[p][0], batch.pairs[p][1])
         distance = wp.float64(0.0)
         if wp.static(with_distances):
-            distance = pad_distance(models, states, objects, a, b, within[p])
-        pose = pair_pose(output != OUTPUT_ANY, models, states, objects, a, b, distance)
+            distance = pad_distance(trees, a, b, within[p])
+        pose = pair_pose(output != OUTPUT_ANY, trees, a, b, distance)
         if wp.static(with_distances):
             if within[p] >= DISTANCE_MAX:
                 # Nothing is proved where distances may overflow: every box passes, and the first faces count as near.
@@ -84,8 +74,8 @@ def pose_starter(with_distances: bool):
                 pose.margin = wp.inf
         if pose.margin >= 0.0 and not is_small(pose, work.small_faces):
             note_descent(work)
-        pose.swapped = wp.where(pairs[p][0] > pairs[p][1], 1, 0)
-        pair_poses[p] = pose
+        pose.swapped = wp.where(batch.pairs[p][0] > batch.pairs[p][1], 1, 0)
+        batch.poses[p] = pose
 
     return start_pose
 
@@ -98,13 +88,9 @@ def relative_poses(with_distances: bool):
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def relative_pose_kernel(
         output: wp.int32,
-        models: ModelPool,
-        states: StatePool,
-        objects: ObjectPool,
-        pair_count: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
+        trees: Trees,
         within: wp.array(dtype=wp.float64),
-        pair_pose_out: wp.array(dtype=PairPose),
+        batch_inout: PairBatch,
         hits_out: Hits,
         work_out: Work,
     ):
@@ -114,18 +100,18 @@ def relative_poses(with_distances: bool):
             within: Distances [world units] that boxes are to be widened by, shape [pair]; [0] for intersection.
         """
         p = wp.tid()
-        count = wp.min(pair_count[0], pairs.shape[0])
+        count = wp.min(batch_inout.count[0], batch_inout.pairs.shape[0])
         if p < work_out.flag.shape[0]:
             work_out.flag[p] = 0
         # By the last thread, which has no pose to wait for unless there are very many.
-        if p == wp.max(pairs.shape[0], work_out.flag.shape[0]) - 1:
+        if p == wp.max(batch_inout.pairs.shape[0], work_out.flag.shape[0]) - 1:
             clear_work(count, work_out)
-        if p >= pairs.shape[0]:
+        if p >= batch_inout.pairs.shape[0]:
             return
         clear_hits(p, hits_out)
         if p >= count:
             return
-        start_pose(p, output, models, states, objects, pairs, within, pair_pose_out, work_out)
+        start_pose(p, output, trees, batch_inout, within, work_out)
 
     return relative_pose_kernel
 
@@ -137,21 +123,14 @@ def pairs_starter(with_distances: bool):
 
     @wp.func
     def start_pairs(
-        output: wp.int32,
-        models: ModelPool,
-        states: StatePool,
-        objects: ObjectPool,
-        started: Started,
-        hits: Hits,
-        work: Work,
+        output: wp.int32, trees: Trees, batch: PairBatch, within: wp.array(dtype=wp.float64), hits: Hits, work: Work
     ):
-        room = started.pairs.shape[0]
-        if room > 0:
-            count = wp.min(started.pair_count[0], room)
-            clear_work(count, work)
-            for p in range(room):
-                clear_hits(p, hits)
-            for p in range(count):
-                start_pose(p, output, models, states, objects, started.pairs, started.within, started.pair_poses, work)
+        room = batch.pairs.shape[0]
+        count = wp.min(batch.count[0], room)
+        clear_work(count, work)
+        for p in range(room):
+            clear_hits(p, hits)
+        for p in range(count):
+            start_pose(p, output, trees, batch, within, work)
 
     return start_pairs

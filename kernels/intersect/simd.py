@@ -9,9 +9,9 @@ import functools
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
 from warp_abtree.kernels.base.counters import take_slots
-from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.exact.predicates import EXACT
 from warp_abtree.kernels.intersect.descent import (
     CPU_STACK_LENGTH,
@@ -37,7 +37,7 @@ from warp_abtree.kernels.intersect.face_pairs import (
     test_faces,
 )
 from warp_abtree.kernels.intersect.near_faces import part_uncertain, report_near
-from warp_abtree.kernels.intersect.relative_pose import Started, pairs_starter
+from warp_abtree.kernels.intersect.relative_pose import ThreadSteps, pairs_starter
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
 from warp_abtree.kernels.search.load_balance import Work, take_thread, take_unit
 
@@ -108,8 +108,7 @@ def report_hits(
 def resolve_faces(
     mode: wp.int32,
     output: wp.int32,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     met: wp.int32,
     waiting: wp.int32,
@@ -128,9 +127,9 @@ def resolve_faces(
             tested += 1
             meets = wp.int32(0)
             if mode == WITHIN:
-                meets = faces_near(models, states, pose, item_first(item), item_second(item))
+                meets = faces_near(trees, pose, item_first(item), item_second(item))
             else:
-                meets = test_faces(mode, models, states, pose, item_first(item), item_second(item))
+                meets = test_faces(mode, trees, pose, item_first(item), item_second(item))
             if meets == 1:
                 met_inout[met] = item
                 met += 1
@@ -141,8 +140,7 @@ def resolve_faces(
 def resolve_uncertain(
     mode: wp.int32,
     output: wp.int32,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     met: wp.int32,
     count: wp.int32,
@@ -156,11 +154,13 @@ def resolve_uncertain(
     Returns how many have met then, how many were decided, and how many of these took exact signs.
     """
     if mode != EXACT:
-        met, tested = resolve_faces(mode, output, models, states, pose, met, count, uncertain, met_inout)
+        met, tested = resolve_faces(mode, output, trees, pose, met, count, uncertain, met_inout)
         return met, tested, 0
-    counts = simd_float64_filter(models, states, pose, output == OUTPUT_ANY, met, count, uncertain, met_inout)
+    counts = simd_float64_filter(
+        trees.models, trees.states, pose, output == OUTPUT_ANY, met, count, uncertain, met_inout
+    )
     met, inexact = resolve_faces(
-        mode, output, models, states, pose, wp.int32(counts[0]), wp.int32(counts[1]), uncertain, met_inout
+        mode, output, trees, pose, wp.int32(counts[0]), wp.int32(counts[1]), uncertain, met_inout
     )
     return met, wp.int32(counts[2]), inexact
 
@@ -179,8 +179,7 @@ def write_counts(p: wp.int32, hit_count: wp.int64, tests: long_counts, hits: Hit
 def test_leaf_pairs(
     mode: wp.int32,
     output: wp.int32,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     waiting: wp.int32,
     faces: wp.array(dtype=wp.int64),
@@ -188,23 +187,30 @@ def test_leaf_pairs(
 ):
     """Test leaf pairs in all stages; return how many met, put in front of the list, and the counts of tests."""
     if mode == WITHIN:
-        near, decided = resolve_faces(mode, output, models, states, pose, 0, waiting, faces, faces)
+        near, decided = resolve_faces(mode, output, trees, pose, 0, waiting, faces, faces)
         return near, long_counts(wp.int64(0), wp.int64(decided), wp.int64(0), wp.int64(0))
     error, unit = float32_bounds(mode, pose)
     filtered = simd_float32_filter(
-        models, states, pose, wp.vec3(error, unit, -1.0), output == OUTPUT_ANY, waiting, faces, uncertain, uncertain
+        trees.models,
+        trees.states,
+        pose,
+        wp.vec3(error, unit, -1.0),
+        output == OUTPUT_ANY,
+        waiting,
+        faces,
+        uncertain,
+        uncertain,
     )
     met, count = wp.int32(filtered[0]), wp.int32(filtered[1])
     resolved, inexact = wp.int32(0), wp.int32(0)
     if count > 0 and not (output == OUTPUT_ANY and met > 0):
-        met, resolved, inexact = resolve_uncertain(mode, output, models, states, pose, met, count, uncertain, faces)
+        met, resolved, inexact = resolve_uncertain(mode, output, trees, pose, met, count, uncertain, faces)
     return met, long_counts(wp.int64(0), filtered[2], wp.int64(resolved), wp.int64(inexact))
 
 
 @wp.func
 def test_gap_pairs(
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     waiting: wp.int32,
     faces: wp.array(dtype=wp.int64),
@@ -214,10 +220,10 @@ def test_gap_pairs(
     """Test leaf pairs as `test_leaf_pairs` and list those that are apart; return how many, after how many met."""
     error, unit = float32_bounds(EXACT, pose)
     bounds = wp.vec3(error, unit, scaled_gap(pose))
-    filtered = simd_float32_filter(models, states, pose, bounds, False, waiting, faces, uncertain, apart)
+    filtered = simd_float32_filter(trees.models, trees.states, pose, bounds, False, waiting, faces, uncertain, apart)
     count = wp.int32(filtered[1])
     met, clear = part_uncertain(
-        models, states, pose, wp.int32(filtered[0]), count, uncertain, wp.int32(filtered[3]), faces, apart
+        trees, pose, wp.int32(filtered[0]), count, uncertain, wp.int32(filtered[3]), faces, apart
     )
     return met, clear, long_counts(wp.int64(0), filtered[2], wp.int64(count), wp.int64(count))
 
@@ -230,21 +236,20 @@ def thread_traversal(mode: int):
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def traverse_thread_kernel(
         output: wp.int32,
-        models: ModelPool,
-        states: StatePool,
-        objects: ObjectPool,
+        trees: Trees,
         plain_tests: wp.int32,
-        started_inout: Started,
+        steps: ThreadSteps,
+        batch_inout: PairBatch,
         memory_inout: wp.array2d(dtype=wp.float32),
         hits_inout: Hits,
         work_inout: Work,
     ):
         """Start all object pairs, by one thread; take one after the other and traverse it depth first. CPU only."""
-        start_pairs(output, models, states, objects, started_inout, hits_inout, work_inout)
-        if started_inout.only:
+        if steps.starts:
+            start_pairs(output, trees, batch_inout, steps.within, hits_inout, work_inout)
+        if not steps.traverses:
             return
-        pair_poses = started_inout.pair_poses
-        count = wp.min(started_inout.pair_count[0], pair_poses.shape[0])
+        count = wp.min(batch_inout.count[0], batch_inout.pairs.shape[0])
         stack = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
         below = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
         faces = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
@@ -254,24 +259,22 @@ def thread_traversal(mode: int):
         descent.thread = take_thread(work_inout.counter)
         p = take_unit(work_inout.counter)
         while p < count:
-            pose = pair_poses[p]
-            stack[0] = first_item(states, pose)
+            pose = batch_inout.poses[p]
+            stack[0] = first_item(trees.states, pose)
             slabs = descent.thread < memory_inout.shape[0] and wp.static(mode != int(WITHIN)) and pose.error < wp.inf
             plain = wp.where(slabs, wp.int64(plain_tests), NEVER)
-            descent = start_descent(output, plain, count_repeats(p, pair_poses), descent)
+            descent = start_descent(output, plain, count_repeats(p, batch_inout.poses), descent)
             hit_count, near_count, tests = wp.int64(0), wp.int64(0), long_counts()
             while descent.top > 0 or descent.deep > 0:
                 descent, waiting, compared = advance(
-                    models, states, pose, hit_count, tests[0], descent, stack, below, memory_inout, faces
+                    trees, pose, hit_count, tests[0], descent, stack, below, memory_inout, faces
                 )
                 met, clear, stages = wp.int32(0), wp.int32(0), long_counts()
                 if wp.static(mode == int(GAP)):
-                    met, clear, stages = test_gap_pairs(models, states, pose, waiting, faces, uncertain, apart)
-                    near_count += wp.int64(report_near(models, states, pose, p, clear, apart, hits_inout))
+                    met, clear, stages = test_gap_pairs(trees, pose, waiting, faces, uncertain, apart)
+                    near_count += wp.int64(report_near(trees, pose, p, clear, apart, hits_inout))
                 else:
-                    met, stages = test_leaf_pairs(
-                        wp.static(mode), output, models, states, pose, waiting, faces, uncertain
-                    )
+                    met, stages = test_leaf_pairs(wp.static(mode), output, trees, pose, waiting, faces, uncertain)
                 tests += stages
                 tests[0] += compared
                 if met > 0:

@@ -7,7 +7,7 @@ lane has a leaf of B, a column, and a bit for each row.
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.boxes import map_point
 from warp_abtree.kernels.base.counters import reserve_slot
 from warp_abtree.kernels.base.lanes import (
@@ -99,20 +99,24 @@ class PosedLeaf:
 
 
 @wp.func
-def pose_leaf(models: ModelPool, states: StatePool, pose: PairPose, node: wp.int32, of_b: bool):
+def pose_leaf(trees: Trees, pose: PairPose, node: wp.int32, of_b: bool):
     """Return the boxes and corners of a leaf."""
     leaf = PosedLeaf()
-    record = load_constant_node(states, wp.where(of_b, pose.node_b, pose.node_a) + node)
+    record = load_constant_node(trees.states, wp.where(of_b, pose.node_b, pose.node_a) + node)
     leaf.lower = record.lower
     leaf.upper = record.upper
     leaf.face = record.face
-    corners = load_corner_ids(states, wp.where(of_b, pose.corner_b, pose.corner_a) + record.face)
+    corners = load_corner_ids(trees.states, wp.where(of_b, pose.corner_b, pose.corner_a) + record.face)
     rotation = pose.rotation32
     shift = pose.translation32
     if not of_b:
         rotation = wp.transpose(rotation)
         shift = pose.back32
-    near_p, near_q, near_r = load_near(models, corners[0]), load_near(models, corners[1]), load_near(models, corners[2])
+    near_p, near_q, near_r = (
+        load_near(trees.models, corners[0]),
+        load_near(trees.models, corners[1]),
+        load_near(trees.models, corners[2]),
+    )
     p, q, r = map_point(rotation, shift, near_p), map_point(rotation, shift, near_q), map_point(rotation, shift, near_r)
     # Corners are rounded where boxes are not; docs/exactness.md has the terms.
     margin = pose.margin + pose.margin
@@ -142,14 +146,7 @@ def place_leaf(items: wp.uint64, row: wp.int32, of_b: bool, keep: bool, leaf: Po
 
 @wp.func
 def place_leaves(
-    items: wp.uint64,
-    of_b: bool,
-    first: wp.int32,
-    step: wp.int32,
-    end: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
+    items: wp.uint64, of_b: bool, first: wp.int32, step: wp.int32, end: wp.int32, trees: Trees, pose: PairPose
 ):
     """Put the next leaves of a list in place, every so many-th, but for those beyond the other's root.
 
@@ -157,13 +154,13 @@ def place_leaves(
     """
     # Lanes may still read the tile before: a vote, which is all that lies between, orders no memory.
     warp_sync()
-    root = load_constant_node(states, wp.where(of_b, pose.node_a, pose.node_b) + 1)
+    root = load_constant_node(trees.states, wp.where(of_b, pose.node_a, pose.node_b) + 1)
     list = wp.where(of_b, SMALL_B, SMALL_A)
     count = wp.int32(0)
     at = wp.int32(first)
     while at < end and count < TILE_FACES:
         mine = at + step * warp_lane()
-        leaf = pose_leaf(models, states, pose, read_number(items, list + wp.min(mine, end - 1)), of_b)
+        leaf = pose_leaf(trees, pose, read_number(items, list + wp.min(mine, end - 1)), of_b)
         keep = mine < end and spans_overlap(leaf.posed_lower, leaf.posed_upper, root.lower, root.upper)
         rank = rank_flag(keep)
         row = count + (rank & 0xFFFF)
@@ -268,16 +265,13 @@ def defer_faces(items: wp.uint64, uncertain: bool, faces: wp.int32, pair: wp.int
 
 @wp.func
 def test_overlaps(
-    # static
     output: wp.int32,
     for_any: bool,
     pair: wp.int32,
     pose: PairPose,
     overlaps: wp.uint32,
     column: wp.int32,
-    # state
     items: wp.uint64,
-    # out
     hits: Hits,
 ):
     """Test the faces in place whose bits are set, and report hits; return how many met, were tested and uncertain."""

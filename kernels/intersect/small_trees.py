@@ -9,7 +9,7 @@ that no warp waits for another where all trees are small.
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.lanes import rank_flag, warp_any, warp_lane, warp_size, warp_sync
 from warp_abtree.kernels.base.nodes import Node, load_constant_node
 from warp_abtree.kernels.base.poses import PairPose
@@ -137,17 +137,13 @@ def count_small(pair: wp.int32, compared: wp.int32, tests: wp.vec3i, hits: Hits)
 
 @wp.func
 def test_small_trees(
-    # static
     output: wp.int32,
     for_any: bool,
     task: wp.vec3i,
     lists: SmallLists,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
-    # state
     items: wp.uint64,
-    # out
     hits: Hits,
 ):
     """Compare the leaves that were gathered and test the leaf pairs in float32, and count all that.
@@ -163,7 +159,7 @@ def test_small_trees(
         of_b = next_b < lists.leaves_b
         first, step = wp.where(of_b, next_b, next_a), wp.where(of_b, 1, task[2])
         end = wp.where(of_b, lists.leaves_b, lists.leaves_a)
-        count, left = place_leaves(items, of_b, first, step, end, models, states, pose)
+        count, left = place_leaves(items, of_b, first, step, end, trees, pose)
         if of_b:
             next_b = left
             column = warp_lane()

@@ -6,10 +6,10 @@ the same few object pairs, and a warp counts for them together.
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool, load_vertex
+from warp_abtree.kernels.base.arrays import Trees, load_vertex
 from warp_abtree.kernels.base.counters import count_flags, reserve_slot
 from warp_abtree.kernels.base.lanes import RESOLVE_WARPS, WARP_SIZE, resolve_lane, warp_size, warp_sync
-from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.exact.predicates import EXACT, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, OUTPUT_FACES, Hits, list_apart, report_hit, test_faces
 from warp_abtree.kernels.search.warp_stack import push_signed_pair, read_signed_pair, signed_pairs
@@ -53,8 +53,7 @@ def list_apart_item(item: wp.vec3i, apart: bool, hits: Hits):
 def resolve_item(
     mode: wp.int32,
     output: wp.int32,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pair_poses: wp.array(dtype=PairPose),
     waits: bool,
     item: wp.vec3i,
@@ -64,7 +63,7 @@ def resolve_item(
     p = item[0]
     meet = wp.int32(0)
     if waits and not (output == OUTPUT_ANY and hits.any_hit[p] != 0):
-        meet = test_faces(mode, models, states, pair_poses[p], item[1], item[2])
+        meet = test_faces(mode, trees, pair_poses[p], item[1], item[2])
     report_item(output, pair_poses, item, meet == 1, hits)
     list_apart_item(item, waits and meet == 0, hits)
 
@@ -89,14 +88,7 @@ def defer_inexact(hits: Hits, inexact: bool, item: wp.vec3i):
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=80)
-def resolve_rounded_kernel(
-    threads: wp.int32,
-    output: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pair_poses: wp.array(dtype=PairPose),
-    hits_inout: Hits,
-):
+def resolve_rounded_kernel(threads: wp.int32, output: wp.int32, trees: Trees, batch: PairBatch, hits_inout: Hits):
     """Decide the uncertain face pairs of FLOAT32 by rounded determinants, in a grid-stride loop."""
     lane = resolve_lane()
     end = wp.min(hits_inout.uncertain_total[0], hits_inout.uncertain.shape[0])
@@ -107,32 +99,32 @@ def resolve_rounded_kernel(
         item = wp.vec3i()
         if waits:
             item = hits_inout.uncertain[first + lane]
-        resolve_item(FLOAT32, output, models, states, pair_poses, waits, item, hits_inout)
+        resolve_item(FLOAT32, output, trees, batch.poses, waits, item, hits_inout)
         first += wp.min(at_once * (threads / warp_size()), end - first)
 
 
 @wp.func
-def item_plane_signs(models: ModelPool, states: StatePool, pose: PairPose, item: wp.vec3i):
+def item_plane_signs(trees: Trees, pose: PairPose, item: wp.vec3i):
     """Return the signs of `filter_planes` for a face pair."""
-    a = load_corner_ids(states, pose.corner_a + item[1])
-    b = load_corner_ids(states, pose.corner_b + item[2])
-    a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
+    a = load_corner_ids(trees.states, pose.corner_a + item[1])
+    b = load_corner_ids(trees.states, pose.corner_b + item[2])
+    a0, a1, a2, b0, b1, b2 = load_face_pair(trees.models, pose, a, b)
     return filter_planes(a0, a1, a2, b0, b1, b2)
 
 
 @wp.func
-def intersect_straddling_item(models: ModelPool, states: StatePool, pose: PairPose, item: wp.vec3i, signs: wp.int32):
+def intersect_straddling_item(trees: Trees, pose: PairPose, item: wp.vec3i, signs: wp.int32):
     """Return whether straddling faces meet, with the signs of `filter_planes`: 1, 0 or UNCERTAIN."""
-    a = load_corner_ids(states, pose.corner_a + item[1])
-    b = load_corner_ids(states, pose.corner_b + item[2])
+    a = load_corner_ids(trees.states, pose.corner_a + item[1])
+    b = load_corner_ids(trees.states, pose.corner_b + item[2])
     p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a[0], a[1], a[2], b[0], b[1], b[2])
     return filter_straddling(
-        load_vertex(models.vertex_pos, p1),
-        load_vertex(models.vertex_pos, q1),
-        load_vertex(models.vertex_pos, r1),
-        pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, p2)),
-        pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, q2)),
-        pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, r2)),
+        load_vertex(trees.models.vertex_pos, p1),
+        load_vertex(trees.models.vertex_pos, q1),
+        load_vertex(trees.models.vertex_pos, r1),
+        pose_point(pose.rotation, pose.translation, load_vertex(trees.models.vertex_pos, p2)),
+        pose_point(pose.rotation, pose.translation, load_vertex(trees.models.vertex_pos, q2)),
+        pose_point(pose.rotation, pose.translation, load_vertex(trees.models.vertex_pos, r2)),
     )
 
 
@@ -142,8 +134,7 @@ def resolve_straddling(
     list: wp.uint64,
     first: wp.int32,
     popped: wp.int32,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pair_poses: wp.array(dtype=PairPose),
     hits: Hits,
 ):
@@ -154,7 +145,7 @@ def resolve_straddling(
     p = item[0]
     meet = wp.int32(1)
     if waiting[3] != SHARED_CORNER:
-        meet = intersect_straddling_item(models, states, pair_poses[p], item, waiting[3])
+        meet = intersect_straddling_item(trees, pair_poses[p], item, waiting[3])
     list_apart_item(item, lane < popped and meet == 0, hits)
     meet = wp.where(lane < popped, meet, 0)
     warp_sync()
@@ -163,14 +154,7 @@ def resolve_straddling(
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=96)
-def float64_filter_kernel(
-    threads: wp.int32,
-    output: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pair_poses: wp.array(dtype=PairPose),
-    hits_inout: Hits,
-):
+def float64_filter_kernel(threads: wp.int32, output: wp.int32, trees: Trees, batch: PairBatch, hits_inout: Hits):
     """Decide the uncertain face pairs, in a grid-stride loop, and list those that are inexact in float64.
 
     Planes first: they separate most pairs, and only straddling pairs take edges, when a warp of them waits.
@@ -187,7 +171,7 @@ def float64_filter_kernel(
             signs = wp.int32(SEPARATED)
             waits = lane < wp.min(at_once, end - first)
             if waits and not (output == OUTPUT_ANY and hits_inout.any_hit[item[0]] != 0):
-                signs = item_plane_signs(models, states, pair_poses[item[0]], item)
+                signs = item_plane_signs(trees, batch.poses[item[0]], item)
             list_apart_item(item, waits and signs == SEPARATED, hits_inout)
             straddling = push_signed_pair(list, straddling, signs >= 0, item, signs)
             defer_inexact(hits_inout, signs == PLANES_UNDECIDED, item)
@@ -196,18 +180,11 @@ def float64_filter_kernel(
         if straddling >= warp_size() or (first >= end and straddling > 0):
             popped = wp.min(straddling, warp_size())
             straddling -= popped
-            resolve_straddling(output, list, straddling, popped, models, states, pair_poses, hits_inout)
+            resolve_straddling(output, list, straddling, popped, trees, batch.poses, hits_inout)
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=168)
-def resolve_inexact_kernel(
-    threads: wp.int32,
-    output: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pair_poses: wp.array(dtype=PairPose),
-    hits_inout: Hits,
-):
+def resolve_inexact_kernel(threads: wp.int32, output: wp.int32, trees: Trees, batch: PairBatch, hits_inout: Hits):
     """Decide the inexact face pairs by exact signs, in a grid-stride loop."""
     lane = resolve_lane()
     end = hits_inout.inexact_total[0]
@@ -218,5 +195,5 @@ def resolve_inexact_kernel(
         item = wp.vec3i()
         if waits:
             item = hits_inout.inexact[first + lane]
-        resolve_item(EXACT, output, models, states, pair_poses, waits, item, hits_inout)
+        resolve_item(EXACT, output, trees, batch.poses, waits, item, hits_inout)
         first += wp.min(at_once * (threads / warp_size()), end - first)

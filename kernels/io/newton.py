@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import ObjectPool
-from warp_abtree.kernels.base.poses import rotate_quaternion
+from warp_abtree.kernels.base.poses import PairBatch, rotate_quaternion
 from warp_abtree.kernels.contacts.manifold import Manifolds
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -119,10 +119,10 @@ def turn_into_body(
 
 
 @wp.kernel
-def count_point_kernel(pair_count: wp.array(dtype=wp.int32), manifolds: Manifolds, count_out: wp.array(dtype=wp.int32)):
+def count_point_kernel(batch: PairBatch, manifolds: Manifolds, count_out: wp.array(dtype=wp.int32)):
     """Count the points of each pair in place, 0 behind the last."""
     p = wp.tid()
-    count_out[p] = wp.where(p < pair_count[0], manifolds.count[p], 0)
+    count_out[p] = wp.where(p < batch.count[0], manifolds.count[p], 0)
 
 
 @wp.kernel
@@ -132,7 +132,7 @@ def write_contact_kernel(
     shapes: wp.array(dtype=wp.int32),
     body_q: wp.array(dtype=wp.transform),
     shape_body: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
+    batch: PairBatch,
     manifolds: Manifolds,
     end: wp.array(dtype=wp.int32),
     count: wp.array(dtype=wp.int32),
@@ -146,10 +146,10 @@ def write_contact_kernel(
         end: Sum of the counts of points up to and with each pair.
     """
     p = wp.tid()
-    if p == pairs.shape[0] - 1:
+    if p == batch.pairs.shape[0] - 1:
         contacts_out.count[0] = first[0] + end[p]
-    shape0 = shapes[pairs[p][0]]
-    shape1 = shapes[pairs[p][1]]
+    shape0 = shapes[batch.pairs[p][0]]
+    shape1 = shapes[batch.pairs[p][1]]
     k = wp.int32(0)
     while k < count[p]:
         at = first[0] + end[p] - count[p] + k

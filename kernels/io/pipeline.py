@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.generation import LaunchRecord, record_launch
-from warp_abtree.kernels.base.poses import rotate_quaternion
+from warp_abtree.kernels.base.poses import PairBatch, rotate_quaternion
 from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart
 from warp_abtree.kernels.io.place_poses import is_quaternion_pose, read_position, read_quaternion
 from warp_abtree.kernels.update.work_lists import note_fault
@@ -43,20 +43,15 @@ def place_object_kernel(
 
 
 @wp.kernel
-def tally_demand_kernel(
-    pair_count: wp.array(dtype=wp.int32),
-    hits: Hits,
-    launched: wp.array(dtype=wp.int32),
-    demand_inout: wp.array(dtype=wp.int64),
-):
+def tally_demand_kernel(batch: PairBatch, hits: Hits, demand_inout: wp.array(dtype=wp.int64)):
     """Keep the greatest demand of any frame: object pairs, face pairs that meet, uncertain face pairs.
 
     The last entry becomes 1 once a frame was stale (`LaunchRecord.launched`).
     Counts past 2^31 are kept, since one thread a pair or hit takes an int32 past its sign bit, not around.
     """
-    demand_inout[0] = wp.max(demand_inout[0], wp.int64(wp.uint32(pair_count[0])))
+    demand_inout[0] = wp.max(demand_inout[0], wp.int64(wp.uint32(batch.count[0])))
     demand_inout[1] = wp.max(demand_inout[1], wp.int64(wp.uint32(hits.total[0])))
     demand_inout[2] = wp.max(demand_inout[2], wp.int64(wp.uint32(hits.uncertain_total[0])))
     if hits.apart.shape[0] > 0:
         demand_inout[2] = wp.max(demand_inout[2], count_apart(hits))
-    demand_inout[3] = wp.max(demand_inout[3], wp.int64(launched[1]))
+    demand_inout[3] = wp.max(demand_inout[3], wp.int64(batch.launched[1]))

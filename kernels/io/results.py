@@ -12,6 +12,7 @@ intersects, n whether it is apart.
 import warp as wp
 
 from warp_abtree.kernels import native
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -29,18 +30,17 @@ def store_flag(words: wp.array(dtype=wp.int64), at: wp.int64, flag: wp.int32):
 @wp.kernel
 def pack_pair_kernel(
     n: wp.int32,
+    with_pairs: wp.bool,
+    batch: PairBatch,
     hits: Hits,
     near_hit: wp.array(dtype=wp.int32),
-    pair_count: wp.array(dtype=wp.int32),
-    launched: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
     words_inout: wp.array(dtype=wp.int64),
 ):
     """Sum the demands of all pairs, and write the first n pairs, one a thread; blocks of threads are whole.
 
     Args:
+        with_pairs: Whether the objects of pairs are written; the host may know them.
         near_hit: Whether each pair is near, shape [pair]; [0] where no distance was asked.
-        pairs: Object pairs to write, shape [pair]; [0] where the host knows them.
         words_inout: Block of n pairs, its header 0.
     """
     i = wp.tid()
@@ -52,8 +52,8 @@ def pack_pair_kernel(
     wp.tile_atomic_add(words_inout, wp.tile_sum(wp.tile(hit_count)), offset=2)
     wp.tile_atomic_add(words_inout, wp.tile_sum(wp.tile(uncertain)), offset=3)
     if i == 0:
-        words_inout[0] = wp.int64(launched[0])
-        words_inout[1] = wp.int64(pair_count[0])
+        words_inout[0] = wp.int64(batch.launched[0])
+        words_inout[1] = wp.int64(batch.count[0])
         words_inout[4] = count_apart(hits)
     if i < n:
         words_inout[HEADER_WORDS + i] = hit_count
@@ -62,9 +62,9 @@ def pack_pair_kernel(
         words_inout[HEADER_WORDS + 3 * n + i] = uncertain
         words_inout[HEADER_WORDS + 4 * n + i] = hits.exact_tests[i]
         end = HEADER_WORDS + COUNT_COLUMNS * n
-        if pairs.shape[0] > 0:
-            first = wp.int64(pairs[i][0])
-            words_inout[end + i] = first | (wp.int64(pairs[i][1]) << wp.int64(32))
+        if with_pairs:
+            first = wp.int64(batch.pairs[i][0])
+            words_inout[end + i] = first | (wp.int64(batch.pairs[i][1]) << wp.int64(32))
             end += n
         flags = wp.int64(8) * wp.int64(end) + wp.int64(i)
         store_flag(words_inout, flags, wp.where(hits.any_hit[i] != 0, 1, 0))

@@ -3,6 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.base.counters import add_lanes
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -22,15 +23,11 @@ TRIANGLE_WORK = wp.constant(wp.int64(4))
 
 @wp.kernel
 def summarise_frame_kernel(
-    # state
-    launched: wp.array(dtype=wp.int32),
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
+    batch: PairBatch,
     hits: Hits,
     marked_count: wp.array(dtype=wp.int32),
     changed: wp.array(dtype=wp.int32),
     level_count: wp.array(dtype=wp.int32),
-    # out
     frames_inout: wp.array(dtype=wp.int64),
     tests_out: wp.array(dtype=wp.int64),
     summary_out: wp.array(dtype=wp.int64),
@@ -51,7 +48,7 @@ def summarise_frame_kernel(
     node_tests = wp.int64(0)
     triangle_tests = wp.int64(0)
     refitted = wp.int64(0)
-    if i < wp.min(pair_count[0], pairs.shape[0]):
+    if i < wp.min(batch.count[0], batch.pairs.shape[0]):
         hit_count = hits.count[i]
         uncertain = hits.float64_tests[i]
         node_tests = hits.node_tests[i]
@@ -59,8 +56,8 @@ def summarise_frame_kernel(
         met = wp.int64(wp.where(hits.any_hit[i] != 0, 1, 0))
         if tests_out.shape[0] > 0:
             tests = node_tests + TRIANGLE_WORK * triangle_tests
-            wp.atomic_add(tests_out, pairs[i][0], tests)
-            wp.atomic_add(tests_out, pairs[i][1], tests)
+            wp.atomic_add(tests_out, batch.pairs[i][0], tests)
+            wp.atomic_add(tests_out, batch.pairs[i][1], tests)
     if i < marked_count.shape[0]:
         refitted = wp.int64(marked_count[i])
     add_lanes(summary_out, wp.static(HITS), hit_count)
@@ -74,8 +71,8 @@ def summarise_frame_kernel(
     if i == 0:
         frames_inout[0] = frames_inout[0] + wp.int64(1)
         summary_out[wp.static(FRAMES)] = frames_inout[0]
-        summary_out[wp.static(LAUNCHED)] = wp.int64(launched[0])
-        summary_out[wp.static(PAIRS)] = wp.int64(pair_count[0])
+        summary_out[wp.static(LAUNCHED)] = wp.int64(batch.launched[0])
+        summary_out[wp.static(PAIRS)] = wp.int64(batch.count[0])
         summary_out[wp.static(APART)] = count_apart(hits)
         summary_out[wp.static(CHANGED)] = wp.int64(changed[0])
         summary_out[wp.static(TURNED)] = wp.int64(changed[1])

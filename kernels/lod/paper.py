@@ -60,13 +60,10 @@ def advance_case_kernel(
 
 @wp.kernel
 def advance_level_kernel(
-    # static
     lods: LodPool,
-    # state
     focus: wp.array(dtype=wp.float64),
     cases: wp.array(dtype=wp.int32),
     level_inout: wp.array(dtype=wp.float64),
-    # out
     lod_out: wp.array(dtype=wp.int32),
 ):
     """Move every object by f g in Case 1 and by g in Case 2, and round to the nearest level.

@@ -95,16 +95,13 @@ def predict_nodes(entries: wp.int32, faces: wp.int32, full_share: wp.float64):
 
 @wp.kernel
 def predict_kernel(
-    # static
     chunks: wp.int32,
     full_share: wp.float64,
     lods: LodPool,
-    # state
     scale: wp.array(dtype=wp.int32),
     offset: wp.array(dtype=wp.int32),
     level: wp.array(dtype=wp.int32),
     tests: wp.array(dtype=wp.int64),
-    # out
     prediction: Prediction,
 ):
     """Predict the tests and refits of every object for every candidate; one thread a candidate and chunk of objects.
@@ -185,17 +182,14 @@ def choose_climb(limit: wp.float64, budget: wp.float64, stay: wp.int32, predicti
 
 @wp.kernel
 def choose_position_kernel(
-    # static
     budget: wp.float64,
     aim: wp.float64,
     low: wp.float64,
     hold_frames: wp.int32,
     position_max: wp.int32,
     stay: wp.int32,
-    # state
     prediction: Prediction,
     scale_inout: wp.array(dtype=wp.int32),
-    # out
     choice_out: wp.array(dtype=wp.float64),
 ):
     """Choose a position on the tolerance scale; one thread.
@@ -241,15 +235,12 @@ def choose_position_kernel(
 
 @wp.kernel
 def set_level_kernel(
-    # static
     held: wp.int32,
     lods: LodPool,
-    # state
     scale: wp.array(dtype=wp.int32),
     offset: wp.array(dtype=wp.int32),
     choice: wp.array(dtype=wp.float64),
     level_inout: wp.array(dtype=wp.int32),
-    # out
     lod_out: wp.array(dtype=wp.int32),
 ):
     """Give every object its level at the position, unless the choice is `held`."""

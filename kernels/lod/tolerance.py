@@ -15,13 +15,10 @@ def loosening(focus: wp.float64, importance: wp.int32, loosest: wp.float64):
 
 @wp.kernel
 def select_tolerance_kernel(
-    # static
     loosest: wp.float64,
     lods: LodPool,
-    # state
     focus: wp.array(dtype=wp.float64),
     tolerance: wp.array(dtype=wp.float64),
-    # out
     lod_out: wp.array(dtype=wp.int32),
 ):
     """Give every object the coarsest level whose certified error is within its tolerance.

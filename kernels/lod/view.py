@@ -9,16 +9,13 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 class ViewArrays:
     """Camera, and the view of each object."""
 
-    # static
     window: wp.int32  # frames of which `motion` is the sum
     object_model: wp.array(dtype=wp.int32)  # [object] model
     centre: wp.array(dtype=wp.vec3d)  # [model] middle, model frame [model units]
     camera: wp.array(dtype=wp.float64)  # [15] eye [world units]; rows right, up, back; focal length, W [pixels]; D
-    # state
     frame: wp.array(dtype=wp.int32)  # [object] frames measured: an entry each, so that no launch need count them
     screen: wp.array(dtype=wp.vec3d)  # [object] x, y on the screen a frame ago [pixels], 1 if in front of the camera
     path: wp.array(dtype=wp.float64)  # [slot * objects + object] motion in each frame of the window [pixels]
-    # out
     distance: wp.array(dtype=wp.float64)  # [object] alpha [world units]
     motion: wp.array(dtype=wp.float64)  # [object] gamma [pixels]
     focus: wp.array(dtype=wp.float64)  # [object] f, 0 to 1

@@ -15,7 +15,7 @@ root's is covered by `EARLIER`, 2^-40 of the step, and that of the time after it
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool, load_vertex
+from warp_abtree.kernels.base.arrays import Trees, load_vertex
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.motion.path import Motion, across, place_motion, reverse_moment
 from warp_abtree.kernels.triangle.distance import corners_type
@@ -64,12 +64,12 @@ class PairProgress:
 
 
 @wp.func
-def load_face(models: ModelPool, states: StatePool, at: wp.int32) -> corners_type:
-    c = states.face_corner[at]
+def load_face(trees: Trees, at: wp.int32) -> corners_type:
+    c = trees.states.face_corner[at]
     return wp.matrix_from_rows(
-        load_vertex(models.vertex_pos, c[0]),
-        load_vertex(models.vertex_pos, c[1]),
-        load_vertex(models.vertex_pos, c[2]),
+        load_vertex(trees.models.vertex_pos, c[0]),
+        load_vertex(trees.models.vertex_pos, c[1]),
+        load_vertex(trees.models.vertex_pos, c[2]),
     )
 
 
@@ -291,8 +291,7 @@ def advance_once(
 @wp.func
 def advance_pair(
     tolerance: wp.float64,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     motion: Motion,
     faces: wp.vec2i,
@@ -303,8 +302,8 @@ def advance_pair(
 
     They go on where `before` says that a step is enough.
     """
-    a = load_face(models, states, pose.corner_a + faces[0])
-    b = load_face(models, states, pose.corner_b + faces[1])
+    a = load_face(trees, pose.corner_a + faces[0])
+    b = load_face(trees, pose.corner_b + faces[1])
     base, mover = wp.where(motion.base == 0, a, b), wp.where(motion.base == 0, b, a)
     bend = bend_of_face(motion, mover)
     contact = FirstContact()

@@ -10,11 +10,11 @@ from typing import Any
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.counters import add_warp_sum
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.lanes import warp_any, warp_lane, warp_min, warp_size, warp_sync
-from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import (
     CLEAR,
@@ -161,8 +161,7 @@ def advance_face_pairs(
     ends: wp.vec3i,
     mode: wp.int32,
     tolerance: wp.float64,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     poses: EndPoses,
     pair_poses: wp.array(dtype=PairPose),
     motion: Any,
@@ -197,7 +196,7 @@ def advance_face_pairs(
     if live:
         p = group.first + slot
         faces = wp.vec2i(item_first(item), item_second(item))
-        own, steps = advance_faces(tolerance, models, states, poses, pair_poses[p], motion[p], faces, progress, best)
+        own, steps = advance_faces(tolerance, trees, poses, pair_poses[p], motion[p], faces, progress, best)
     group.faces = count_in(group.faces, slot, wp.where(live and mode != ONE_STEP, 1, 0))
     group = take_contacts(group, slot, own)
     goes_on = own.end == IN_PROGRESS and own.time <= time_of(group, slot)
@@ -241,8 +240,7 @@ def search_group(
     items: wp.uint64,
     room: wp.int32,
     tolerance: wp.float64,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     poses: EndPoses,
     pair_poses: wp.array(dtype=PairPose),
     motion: Any,
@@ -265,7 +263,9 @@ def search_group(
             warp_sync()
             children, kinds, times, compared = four_items(), wp.vec4i(), wp.vec4(), wp.int32(0)
             if warp_any(live < 0):
-                children, kinds, times, compared = advance_nodes(states, pair_poses[p], motion[p], t, best, item, live)
+                children, kinds, times, compared = advance_nodes(
+                    trees.states, pair_poses[p], motion[p], t, best, item, live
+                )
             pushed = push_steps(items, wp.vec2i(end, ends[1]), slot, kinds, children, times)
             warp_sync()
             ends = wp.vec3i(pushed[0], pushed[1], ends[2])
@@ -273,9 +273,7 @@ def search_group(
         mode = wp.where(ends[2] >= warp_size() or ends[1] == 0, ONE_STEP, NORMALS)
         most = wp.where(mode == ONE_STEP, ends[2], ends[1])
         if most >= warp_size() or (ends[0] == 0 and most > 0):
-            group, ends = advance_face_pairs(
-                items, ends, mode, tolerance, models, states, poses, pair_poses, motion, group
-            )
+            group, ends = advance_face_pairs(items, ends, mode, tolerance, trees, poses, pair_poses, motion, group)
     return group
 
 
@@ -286,32 +284,27 @@ def warp_search(kind):
     # Fourteen warps a multiprocessor hide more of what loads wait for than spilled registers cost.
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, launch_bounds=(32, 14))
     def search_warp_kernel(
-        # static
         room: wp.int32,
         tolerance: wp.float64,
-        models: ModelPool,
-        # state
-        states: StatePool,
+        trees: Trees,
         poses: EndPoses,
-        pair_count: wp.array(dtype=wp.int32),
-        pair_poses: wp.array(dtype=PairPose),
+        batch: PairBatch,
         motion: wp.array(dtype=kind),
-        # out
         hits_inout: Hits,
         contacts_inout: FirstContacts,
     ):
         """Search the object pairs that are open, a few a warp."""
-        count = pair_count[0]
+        count = batch.count[0]
         size = wp.where(count >= GROUPED_LEAST, GROUP, 1)
         first = size * (wp.tid() / warp_size())
-        if first >= count or contacts_inout.launched[0] == STALE:
+        if first >= count or batch.launched[0] == STALE:
             return
         items = motion_stack()
-        group, roots = start_group(items, first, size, count, states, pair_poses, contacts_inout)
+        group, roots = start_group(items, first, size, count, trees.states, batch.poses, contacts_inout)
         if roots == 0:
             return
         stack_room = wp.where(room < STACK_LENGTH, room, MOTION_STACK_LENGTH)
-        group = search_group(items, stack_room, tolerance, models, states, poses, pair_poses, motion, group, roots)
+        group = search_group(items, stack_room, tolerance, trees, poses, batch.poses, motion, group, roots)
         for k in range(4):
             p = first + k
             if k < size and p < count:

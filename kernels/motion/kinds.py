@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ObjectPool, StatePool, Trees
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.motion.face_pair import PairProgress, advance_pair
 from warp_abtree.kernels.motion.linear import (
@@ -20,34 +20,18 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-def make_motion(
-    kind: Motion,
-    paths: Paths,
-    ends: ObjectPool,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pose: PairPose,
-    pair: wp.vec2i,
-):
+def make_motion(kind: Motion, paths: Paths, ends: ObjectPool, trees: Trees, pose: PairPose, pair: wp.vec2i):
     """Return the motion of objects a < b of the kind that is named."""
-    motion = start_motion(paths, models, states, objects, pair)
-    return bound_motion(motion, states, pose, pair_skew(objects, pair[0], motion.first))
+    motion = start_motion(paths, trees, pair)
+    return bound_motion(motion, trees.states, pose, pair_skew(trees.objects, pair[0], motion.first))
 
 
 @wp.func
 def make_motion(  # noqa: F811 - Warp takes the one for the type
-    kind: LinearMotion,
-    paths: Paths,
-    ends: ObjectPool,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pose: PairPose,
-    pair: wp.vec2i,
+    kind: LinearMotion, paths: Paths, ends: ObjectPool, trees: Trees, pose: PairPose, pair: wp.vec2i
 ):
-    motion = start_linear_motion(ends, models, states, objects, pair)
-    return bound_linear_motion(motion, states, pose, pair_skew(objects, pair[0], motion.first))
+    motion = start_linear_motion(ends, trees, pair)
+    return bound_linear_motion(motion, trees.states, pose, pair_skew(trees.objects, pair[0], motion.first))
 
 
 @wp.func
@@ -94,8 +78,7 @@ def advance_nodes(  # noqa: F811
 @wp.func
 def advance_faces(
     tolerance: wp.float64,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     poses: EndPoses,
     pose: PairPose,
     motion: Motion,
@@ -104,15 +87,14 @@ def advance_faces(
     best: wp.float64,
 ):
     """Return the `FirstContact` of a face of A and one of B, and the steps made so far."""
-    contact, steps = advance_pair(tolerance, models, states, pose, motion, faces, before, best)
+    contact, steps = advance_pair(tolerance, trees, pose, motion, faces, before, best)
     return contact, steps
 
 
 @wp.func
 def advance_faces(  # noqa: F811
     tolerance: wp.float64,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     poses: EndPoses,
     pose: PairPose,
     motion: LinearMotion,
@@ -120,5 +102,5 @@ def advance_faces(  # noqa: F811
     before: PairProgress,
     best: wp.float64,
 ):
-    contact = advance_linear_pair(tolerance, models, states, poses, pose, motion, faces[0], faces[1], before.time, best)
+    contact = advance_linear_pair(tolerance, trees, poses, pose, motion, faces[0], faces[1], before.time, best)
     return contact, wp.int32(0)

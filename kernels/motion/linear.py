@@ -9,7 +9,7 @@ grows at a rate s stays open until g + s h = 0; of faces it is taken for each of
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ObjectPool, StatePool, Trees
 from warp_abtree.kernels.base.boxes import pose_box
 from warp_abtree.kernels.base.nodes import Node, load_constant_node, load_node
 from warp_abtree.kernels.base.poses import ROUNDING_32, SCALE_MAX, PairPose, reach_box
@@ -89,22 +89,20 @@ class Seen:
 
 
 @wp.func
-def start_linear_motion(
-    ends: ObjectPool, models: ModelPool, states: StatePool, objects: ObjectPool, pair: wp.vec2i
-) -> LinearMotion:
+def start_linear_motion(ends: ObjectPool, trees: Trees, pair: wp.vec2i) -> LinearMotion:
     """Return the motion of objects a < b, but for its bounds."""
     a, b = pair[0], pair[1]
-    home = wp.transpose(objects.rotation[a])
+    home = wp.transpose(trees.objects.rotation[a])
     motion = LinearMotion()
     motion.objects = pair
-    motion.first = home * objects.rotation[b]
-    motion.offset = home * (objects.position[b] - objects.position[a])
-    motion.way_a = home * ends.rotation[a] - home * objects.rotation[a]
-    motion.shift_a = home * (ends.position[a] - objects.position[a])
+    motion.first = home * trees.objects.rotation[b]
+    motion.offset = home * (trees.objects.position[b] - trees.objects.position[a])
+    motion.way_a = home * ends.rotation[a] - home * trees.objects.rotation[a]
+    motion.shift_a = home * (ends.position[a] - trees.objects.position[a])
     motion.way_b = home * ends.rotation[b] - motion.first
-    motion.shift_b = home * (ends.position[b] - objects.position[b])
-    motion.centre_a = models.centre[states.model[objects.state[a]]]
-    motion.centre_b = models.centre[states.model[objects.state[b]]]
+    motion.shift_b = home * (ends.position[b] - trees.objects.position[b])
+    motion.centre_a = trees.models.centre[trees.states.model[trees.objects.state[a]]]
+    motion.centre_b = trees.models.centre[trees.states.model[trees.objects.state[b]]]
     return motion
 
 
@@ -310,8 +308,7 @@ def resolve_in_world(
 @wp.func
 def advance_linear_pair(
     tolerance: wp.float64,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     poses: EndPoses,
     pose: PairPose,
     motion: LinearMotion,
@@ -321,8 +318,8 @@ def advance_linear_pair(
     best: wp.float64,
 ):
     """Return the `FirstContact` of a face of A and one of B."""
-    a = load_face(models, states, pose.corner_a + face_a)
-    b = load_face(models, states, pose.corner_b + face_b)
+    a = load_face(trees, pose.corner_a + face_a)
+    b = load_face(trees, pose.corner_b + face_b)
     way_a = map_corners(motion.way_a, motion.shift_a, a)
     way_b = map_corners(motion.way_b, motion.shift_b, b)
     at_b = map_corners(motion.first, motion.offset, b)

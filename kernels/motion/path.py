@@ -28,7 +28,7 @@ in the model frames, B's point b lies in A's frame at R b + x, where it moves wi
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ObjectPool, StatePool, Trees
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import ROUNDING_32, SCALE_MAX, PairPose, measure_rotation, reach_box, sum_products
 from warp_abtree.kernels.motion.turn import shortest_turn, turn_matrix
@@ -179,10 +179,10 @@ def bend_of(
 
 
 @wp.func
-def start_motion(paths: Paths, models: ModelPool, states: StatePool, objects: ObjectPool, pair: wp.vec2i):
+def start_motion(paths: Paths, trees: Trees, pair: wp.vec2i):
     """Return the `Motion` of objects a < b; its base, bounds and margins are those of `bound_motion`."""
     a, b = pair[0], pair[1]
-    ra, rb = objects.rotation[a], objects.rotation[b]
+    ra, rb = trees.objects.rotation[a], trees.objects.rotation[b]
     shift = paths.start[b] - paths.start[a]
     travel = paths.travel[b] - paths.travel[a]
     motion = Motion()
@@ -199,8 +199,8 @@ def start_motion(paths: Paths, models: ModelPool, states: StatePool, objects: Ob
     motion.angle_b = paths.angle[b]
     if motion.angle_b < wp.float64(0.0):
         motion.angle_a = motion.angle_b
-    motion.centre_a = models.centre[states.model[objects.state[a]]]
-    motion.centre_b = models.centre[states.model[objects.state[b]]]
+    motion.centre_a = trees.models.centre[trees.states.model[trees.objects.state[a]]]
+    motion.centre_b = trees.models.centre[trees.states.model[trees.objects.state[b]]]
     return motion
 
 

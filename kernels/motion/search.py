@@ -11,9 +11,9 @@ from typing import Any
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.generation import STALE
-from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, TO_THE_END, TOUCHES, FirstContact, PairProgress
 from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
@@ -41,8 +41,7 @@ def advance_face_pair(
     items: wp.uint64,
     i: wp.int32,
     tolerance: wp.float64,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     poses: EndPoses,
     pose: PairPose,
     motion: Any,
@@ -57,7 +56,7 @@ def advance_face_pair(
         return best, 0
     item = read_item(items, STACK_LENGTH + i)
     faces = wp.vec2i(item_first(item), item_second(item))
-    own, _ = advance_faces(tolerance, models, states, poses, pose, motion, faces, progress, best.time)
+    own, _ = advance_faces(tolerance, trees, poses, pose, motion, faces, progress, best.time)
     if own.end != CLEAR and (own.time < best.time or (own.time == best.time and best.end != TOUCHES)):
         # A pair that is undecided at the same time does not matter.
         best = own
@@ -68,8 +67,7 @@ def advance_face_pair(
 def search_contact(
     items: wp.uint64,
     tolerance: wp.float64,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     poses: EndPoses,
     pose: PairPose,
     motions: Any,
@@ -80,20 +78,20 @@ def search_contact(
     best = FirstContact()
     best.time = wp.float64(1.0)
     best.end = CLEAR
-    write_item(items, 0, first_item(states, pose))
+    write_item(items, 0, first_item(trees.states, pose))
     write_bound(items, 0, wp.float32(start))
     end, waiting = wp.int32(1), wp.int32(0)
     tests = wp.vec2i()
     while end > 0 or waiting > 0:
         if waiting > 0:
             waiting -= 1
-            best, advanced = advance_face_pair(items, waiting, tolerance, models, states, poses, pose, motions[p], best)
+            best, advanced = advance_face_pair(items, waiting, tolerance, trees, poses, pose, motions[p], best)
             tests[1] += advanced
         else:
             end -= 1
             item, t = read_item(items, end), read_bound(items, end)
             if wp.float64(t) <= best.time:
-                children, kinds, times, compared = advance_nodes(states, pose, motions[p], t, best.time, item, -1)
+                children, kinds, times, compared = advance_nodes(trees.states, pose, motions[p], t, best.time, item, -1)
                 ends = push_nearest(items, end, waiting, kinds, children, times)
                 end = item_second(ends)
                 waiting = item_first(ends)
@@ -107,24 +105,19 @@ def thread_search(kind):
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def search_thread_kernel(
-        # static
         tolerance: wp.float64,
-        models: ModelPool,
-        # state
-        states: StatePool,
+        trees: Trees,
         poses: EndPoses,
-        pair_count: wp.array(dtype=wp.int32),
-        pair_poses: wp.array(dtype=PairPose),
+        batch: PairBatch,
         motion: wp.array(dtype=kind),
-        # out
         hits_inout: Hits,
         contacts_inout: FirstContacts,
         memory_out: wp.array2d(dtype=wp.int64),
     ):
         """Take one object pair after the other that is open, and search it; CPU only."""
-        if contacts_inout.launched[0] == STALE:
+        if batch.launched[0] == STALE:
             return
-        count = wp.min(pair_count[0], pair_poses.shape[0])
+        count = wp.min(batch.count[0], batch.poses.shape[0])
         thread = take_thread(contacts_inout.counter)
         if thread >= memory_out.shape[0]:
             return
@@ -132,8 +125,8 @@ def thread_search(kind):
         p = take_unit(contacts_inout.counter)
         while p < count:
             if contacts_inout.end[p] == OPEN:
-                pose, start = pair_poses[p], contacts_inout.time[p]
-                contact, tests = search_contact(items, tolerance, models, states, poses, pose, motion, p, start)
+                pose, start = batch.poses[p], contacts_inout.time[p]
+                contact, tests = search_contact(items, tolerance, trees, poses, pose, motion, p, start)
                 contacts_inout.time[p] = contact.time
                 contacts_inout.end[p] = contact.end
                 hits_inout.node_tests[p] += wp.int64(tests[0])

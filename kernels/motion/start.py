@@ -10,11 +10,11 @@ from typing import Any
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ObjectPool, StatePool, Trees
 from warp_abtree.kernels.base.boxes import round_down, round_up
 from warp_abtree.kernels.base.generation import STALE, LaunchRecord, is_stale
 from warp_abtree.kernels.base.nodes import load_node
-from warp_abtree.kernels.base.poses import ROUNDING_64, PairPose, measure_skew
+from warp_abtree.kernels.base.poses import ROUNDING_64, PairBatch, PairPose, measure_skew
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED
 from warp_abtree.kernels.motion.kinds import advance_nodes, has_way, make_motion
@@ -39,7 +39,6 @@ class FirstContacts:
     time: wp.array(dtype=wp.float64)  # of first contact, 1 where clear
     end: wp.array(dtype=wp.int32)  # CLEAR, TOUCHES, UNDECIDED, OPEN or HALF_TURN
     counter: wp.array(dtype=wp.int32)  # of threads and object pairs that are taken, as `load_balance` counts
-    launched: wp.array(dtype=wp.int32)  # STALE where nothing is to be done, see `generation.LaunchRecord`
 
 
 @wp.struct
@@ -73,13 +72,9 @@ def contact_starter(kind):
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def start_contact_kernel(
-        models: ModelPool,
-        states: StatePool,
-        objects: ObjectPool,
+        trees: Trees,
         motions: Motions,
-        pair_count: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
-        pair_poses: wp.array(dtype=PairPose),
+        batch: PairBatch,
         hits_inout: Hits,
         contacts_inout: FirstContacts,
         motion_out: wp.array(dtype=kind),
@@ -89,9 +84,9 @@ def contact_starter(kind):
         if p == 0:
             contacts_inout.counter[1] = 0
             contacts_inout.counter[3] = 0
-        if p >= pair_count[0] or contacts_inout.launched[0] == STALE:
+        if p >= batch.count[0] or batch.launched[0] == STALE:
             return
-        pair = wp.vec2i(wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1]))
+        pair = wp.vec2i(wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1]))
         contacts_inout.time[p] = wp.float64(0.0)
         if hits_inout.any_hit[p] != 0:
             contacts_inout.end[p] = TOUCHES
@@ -100,12 +95,12 @@ def contact_starter(kind):
         if not has_way(motion, motions.paths, pair):
             contacts_inout.end[p] = HALF_TURN
             return
-        motion = make_motion(motion, motions.paths, motions.ends, models, states, objects, pair_poses[p], pair)
+        motion = make_motion(motion, motions.paths, motions.ends, trees, batch.poses[p], pair)
         if not (motion.slack < wp.float64(wp.inf)):
             # Beyond float64, or no numbers: nothing could be proved.
             contacts_inout.end[p] = UNDECIDED
             return
-        t, clear, tests = advance_roots(states, pair_poses[p], motion)
+        t, clear, tests = advance_roots(trees.states, batch.poses[p], motion)
         hits_inout.node_tests[p] += wp.int64(tests)
         contacts_inout.time[p] = wp.where(clear, wp.float64(1.0), wp.float64(t))
         contacts_inout.end[p] = wp.where(clear, CLEAR, OPEN)
@@ -134,9 +129,7 @@ def extend_box(
 def sweep_box_kernel(
     linear: bool,
     screw: bool,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
+    trees: Trees,
     ends: ObjectPool,
     record: LaunchRecord,
     lower_out: wp.array(dtype=wp.vec3),
@@ -144,13 +137,13 @@ def sweep_box_kernel(
 ):
     """Box the root box of each object on its way in the world; as `broad_phase.pose_box_kernel`."""
     i = wp.tid()
-    state = objects.state[i]
-    root = load_node(states, states.node_start[state] + 1)
+    state = trees.objects.state[i]
+    root = load_node(trees.states, trees.states.node_start[state] + 1)
     lower, upper = wp.vec3d(root.lower), wp.vec3d(root.upper)
-    middle = models.centre[states.model[state]] + wp.float64(0.5) * (lower + upper)
+    middle = trees.models.centre[trees.states.model[state]] + wp.float64(0.5) * (lower + upper)
     half = wp.float64(0.5) * (upper - lower)
-    path = make_path(screw, objects, ends, i)
-    r, p, q = objects.rotation[i], objects.position[i], ends.position[i]
+    path = make_path(screw, trees.objects, ends, i)
+    r, p, q = trees.objects.rotation[i], trees.objects.position[i], ends.position[i]
     reach = wp.length(middle - path.anchor) + wp.length(half)
     sizes = wp.length(middle) + wp.length(half) + wp.length(path.anchor) + wp.length(p) + wp.length(q)
     skew = wp.float64(3.0) * wp.max(measure_skew(r), measure_skew(ends.rotation[i]))

@@ -3,6 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import pair_key
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.distance.report import Distances, two_points
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.robot.link_pairs import Chunk
@@ -41,8 +42,7 @@ def note_demand(pair_count: wp.array(dtype=wp.int32), hits: Hits, demand: wp.arr
 def note_hit_kernel(
     around: wp.int32,
     part_count: wp.int32,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
+    batch: PairBatch,
     hits: Hits,
     near: wp.array(dtype=wp.int32),
     chunk_inout: Chunk,
@@ -51,10 +51,10 @@ def note_hit_kernel(
     """Note which configurations have a pair that intersects, or one that is not proved apart."""
     p = wp.tid()
     if p == 0:
-        note_demand(pair_count, hits, demand_inout)
-    if p >= wp.min(pair_count[0], pairs.shape[0]):
+        note_demand(batch.count, hits, demand_inout)
+    if p >= wp.min(batch.count[0], batch.pairs.shape[0]):
         return
-    i = configuration_of(pairs[p], around, part_count)
+    i = configuration_of(batch.pairs[p], around, part_count)
     if hits.any_hit[p] != 0:
         chunk_inout.hit[i] = wp.uint8(1)
     if near.shape[0] > 0:
@@ -66,8 +66,7 @@ def note_hit_kernel(
 def note_distance_kernel(
     around: wp.int32,
     part_count: wp.int32,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
+    batch: PairBatch,
     hits: Hits,
     distances: Distances,
     chunk_inout: Chunk,
@@ -76,10 +75,10 @@ def note_distance_kernel(
     """Note the least distance of each configuration."""
     p = wp.tid()
     if p == 0:
-        note_demand(pair_count, hits, demand_inout)
-    if p >= wp.min(pair_count[0], pairs.shape[0]):
+        note_demand(batch.count, hits, demand_inout)
+    if p >= wp.min(batch.count[0], batch.pairs.shape[0]):
         return
-    i = configuration_of(pairs[p], around, part_count)
+    i = configuration_of(batch.pairs[p], around, part_count)
     wp.atomic_min(chunk_inout.best, i, distances.distance[p])
 
 
@@ -87,41 +86,39 @@ def note_distance_kernel(
 def find_winner_kernel(
     around: wp.int32,
     part_count: wp.int32,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
+    batch: PairBatch,
     distances: Distances,
     chunk: Chunk,
     nearest_inout: NearestParts,
 ):
     """Find the first of the pairs at the least distance of each configuration, if that has become less."""
     p = wp.tid()
-    if p >= wp.min(pair_count[0], pairs.shape[0]):
+    if p >= wp.min(batch.count[0], batch.pairs.shape[0]):
         return
-    i = configuration_of(pairs[p], around, part_count)
+    i = configuration_of(batch.pairs[p], around, part_count)
     distance = distances.distance[p]
     if distance == chunk.best[i] and distance < nearest_inout.distance[i]:
-        wp.atomic_min(nearest_inout.winner, i, pair_key(pairs[p]))
+        wp.atomic_min(nearest_inout.winner, i, pair_key(batch.pairs[p]))
 
 
 @wp.kernel
 def write_nearest_kernel(
     around: wp.int32,
     part_count: wp.int32,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
+    batch: PairBatch,
     distances: Distances,
     nearest_inout: NearestParts,
     chunk_inout: Chunk,
 ):
     """Write the answers of the pairs of `find_winner_kernel`; pairs that intersect are settled."""
     p = wp.tid()
-    if p >= wp.min(pair_count[0], pairs.shape[0]):
+    if p >= wp.min(batch.count[0], batch.pairs.shape[0]):
         return
-    i = configuration_of(pairs[p], around, part_count)
-    if nearest_inout.winner[i] == pair_key(pairs[p]):
+    i = configuration_of(batch.pairs[p], around, part_count)
+    if nearest_inout.winner[i] == pair_key(batch.pairs[p]):
         nearest_inout.distance[i] = distances.distance[p]
         nearest_inout.points[i] = distances.points[p]
         nearest_inout.faces[i] = distances.faces[p]
-        nearest_inout.pair[i] = pairs[p]
+        nearest_inout.pair[i] = batch.pairs[p]
         if distances.distance[p] == wp.float64(0.0):
             chunk_inout.hit[i] = wp.uint8(1)

@@ -128,14 +128,12 @@ def boxes_meet(lower: wp.vec3, upper: wp.vec3, low: wp.vec3, high: wp.vec3):
 
 @wp.kernel
 def find_link_pair_kernel(
-    # static
     mode: wp.int32,
     stage: wp.vec2i,
     around: wp.int32,
     bvh: wp.uint64,
     chain: Chain,
     parts: Parts,
-    # state
     frames: Frames,
     lower: wp.array(dtype=wp.vec3),
     upper: wp.array(dtype=wp.vec3),

@@ -15,7 +15,7 @@ A slab is two entries of 16 bytes a node, as `nodes.Node` has:
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.boxes import round_down, round_up
 from warp_abtree.kernels.base.lanes import block_sync
 from warp_abtree.kernels.base.nodes import Node, load_node, store_entry
@@ -104,12 +104,12 @@ def middle_of(node: Node):
 
 
 @wp.func
-def face_slab(models: ModelPool, states: StatePool, node: Node, at: wp.int32):
+def face_slab(trees: Trees, node: Node, at: wp.int32):
     """Return the slab of one active face."""
-    c = states.face_corner[at]
-    p = models.vertex_near[c[0]]
-    q = models.vertex_near[c[1]]
-    r = models.vertex_near[c[2]]
+    c = trees.states.face_corner[at]
+    p = trees.models.vertex_near[c[0]]
+    q = trees.models.vertex_near[c[1]]
+    r = trees.models.vertex_near[c[2]]
     a = wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
     b = wp.vec3d(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]))
     d = wp.vec3d(wp.float64(r[0]), wp.float64(r[1]), wp.float64(r[2]))
@@ -156,17 +156,17 @@ def join_slabs(states: StatePool, slabs: Slabs, node: Node, at: wp.int32):
 
 
 @wp.func
-def make_slab(models: ModelPool, states: StatePool, slabs: Slabs, state: wp.int32, i: wp.int32):
+def make_slab(trees: Trees, slabs: Slabs, state: wp.int32, i: wp.int32):
     """Make the slab of node i of a state, if it is active; those of the nodes below are made."""
-    start = states.node_start[state]
-    node = load_node(states, start + i)
+    start = trees.states.node_start[state]
+    node = load_node(trees.states, start + i)
     if node.skip >= 0:
         if node.face >= 0:
-            store_mean_slab(slabs, start + i, face_slab(models, states, node, states.face_start[state] + node.face))
+            store_mean_slab(slabs, start + i, face_slab(trees, node, trees.states.face_start[state] + node.face))
         elif node.skip != i:
             store_mean_slab(slabs, start + i, load_mean_slab(slabs, start + node.skip))
         else:
-            store_mean_slab(slabs, start + i, join_slabs(states, slabs, node, start + 2 * i))
+            store_mean_slab(slabs, start + i, join_slabs(trees.states, slabs, node, start + 2 * i))
 
 
 @wp.func
@@ -189,88 +189,66 @@ def has_mean_slabs(states: StatePool, slabs: Slabs, p: wp.int32):
 
 
 @wp.func
-def count_use(models: ModelPool, states: StatePool, slabs: Slabs, state: wp.int32):
+def count_use(trees: Trees, slabs: Slabs, state: wp.int32):
     """Count a pair that is searched without slabs of a state; return whether they are to be made now."""
-    end = states.node_start[state] + (wp.int32(2) << models.depth[states.model[state]])
+    end = trees.states.node_start[state] + (wp.int32(2) << trees.models.depth[trees.states.model[state]])
     # What a graph has no room for has none.
-    if state >= slabs.made.shape[0] or 2 * end > slabs.record.shape[0] or is_made(states, slabs, state):
+    if state >= slabs.made.shape[0] or 2 * end > slabs.record.shape[0] or is_made(trees.states, slabs, state):
         return False
     return slabs.uses[state] < USES_MIN and wp.atomic_add(slabs.uses, state, 1) == USES_MIN - 1
 
 
 @wp.func
-def count_uses(
-    p: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    slabs: Slabs,
-):
+def count_uses(p: wp.int32, trees: Trees, pairs: wp.array(dtype=wp.vec2i), slabs: Slabs):
     """Count an object pair, and list its states whose slabs are to be made now."""
-    own = wp.vec2i(objects.state[pairs[p][0]], objects.state[pairs[p][1]])
+    own = wp.vec2i(trees.objects.state[pairs[p][0]], trees.objects.state[pairs[p][1]])
     slabs.states[p] = own
     for k in range(2):
-        if count_use(models, states, slabs, own[k]):
+        if count_use(trees, slabs, own[k]):
             slabs.due[wp.atomic_add(slabs.due_count, 0, 1)] = own[k]
 
 
 @wp.func
 def make_below(
-    top: wp.int32,
-    levels: wp.int32,
-    thread: wp.int32,
-    threads: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    slabs: Slabs,
-    state: wp.int32,
+    top: wp.int32, levels: wp.int32, thread: wp.int32, threads: wp.int32, trees: Trees, slabs: Slabs, state: wp.int32
 ):
     """Make the slabs of a node and of so many levels below it, children first, by the threads of a block."""
     level = levels
     while level >= 0:
         i = thread
         while i < wp.int32(1) << level:
-            make_slab(models, states, slabs, state, (top << level) + i)
+            make_slab(trees, slabs, state, (top << level) + i)
             i += threads
         block_sync()
         level -= 1
 
 
 @wp.func
-def make_due(
-    first: wp.int32,
-    step: wp.int32,
-    thread: wp.int32,
-    threads: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    slabs: Slabs,
-):
+def make_due(first: wp.int32, step: wp.int32, thread: wp.int32, threads: wp.int32, trees: Trees, slabs: Slabs):
     """Make the listed states' slabs: each block builds every `step`-th subtree, the last to finish the levels above.
 
     Subtrees are shared among blocks; the block that ends the last one of a state makes what is above.
     """
     for k in range(slabs.due_count[0]):
         state = slabs.due[k]
-        depth = models.depth[states.model[state]]
+        depth = trees.models.depth[trees.states.model[state]]
         above = wp.max(0, depth - SUBTREE_LEVELS)
         made = wp.int32(0)
         i = (first + k) % step
         while i < wp.int32(1) << above:
-            make_below((wp.int32(1) << above) + i, depth - above, thread, threads, models, states, slabs, state)
+            make_below((wp.int32(1) << above) + i, depth - above, thread, threads, trees, slabs, state)
             made += 1
             i += step
         if made > 0 and is_last_block(slabs.ended, state, made, wp.int32(1) << above):
-            make_below(1, above - 1, thread, threads, models, states, slabs, state)
+            make_below(1, above - 1, thread, threads, trees, slabs, state)
             if thread == 0:
-                slabs.made[state] = key_of(states, state)
+                slabs.made[state] = key_of(trees.states, state)
                 slabs.uses[state] = 0
                 slabs.ended[state] = 0
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS | {"block_dim": SLAB_THREADS})
-def make_slabs_kernel(threads: wp.int32, blocks: wp.int32, models: ModelPool, states: StatePool, slabs_inout: Slabs):
+def make_slabs_kernel(threads: wp.int32, blocks: wp.int32, trees: Trees, slabs_inout: Slabs):
     """Make the slabs that are due."""
     i = wp.tid()
-    make_due(i / threads, blocks, i % threads, threads, models, states, slabs_inout)
+    make_due(i / threads, blocks, i % threads, threads, trees, slabs_inout)

@@ -11,7 +11,7 @@ has the margin. A record:
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, Trees
 from warp_abtree.kernels.base.boxes import fuse32, map_point
 from warp_abtree.kernels.base.nodes import load_constant, load_constant_node
 from warp_abtree.kernels.base.poses import PairPose
@@ -95,17 +95,17 @@ def overlaps_along(
 
 
 @wp.func
-def slabs_overlap(models: ModelPool, states: StatePool, pose: PairPose, item: wp.int64):
+def slabs_overlap(trees: Trees, pose: PairPose, item: wp.int64):
     """Return False only where the slabs of an item's two nodes separate them."""
     x = item_first(item)
     y = item_second(item)
     # Children are named by the first of them.
     x = wp.where(x < 0, (x & INDEX_MASK) >> 1, x)
     y = wp.where(y < 0, (y & INDEX_MASK) >> 1, y)
-    node_a = load_constant_node(states, pose.node_a + x)
-    node_b = load_constant_node(states, pose.node_b + y)
-    a = load_node_slab(models, pose.slab[0] + x)
-    b = load_node_slab(models, pose.slab[1] + y)
+    node_a = load_constant_node(trees.states, pose.node_a + x)
+    node_b = load_constant_node(trees.states, pose.node_b + y)
+    a = load_node_slab(trees.models, pose.slab[0] + x)
+    b = load_node_slab(trees.models, pose.slab[1] + y)
     zero = wp.vec3()
     a_there = map_point(wp.transpose(pose.rotation32), zero, a.direction)
     b_there = map_point(pose.rotation32, zero, b.direction)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool, load_vertex
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees, load_vertex
 from warp_abtree.kernels.base.nodes import load_constant
 from warp_abtree.kernels.base.poses import PairPose, pose_point
 from warp_abtree.kernels.triangle.triangle_pair import scale_triangles
@@ -12,28 +12,21 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-def load_corners(
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    face_a: wp.int32,
-    face_b: wp.int32,
-    corner: wp.array(dtype=wp.vec3d),
-):
+def load_corners(trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.int32, corner: wp.array(dtype=wp.vec3d)):
     """Put the corners of a face of A and of one of B, both in A's frame, into places 0..2 and 3..5."""
-    a = states.face_corner[pose.corner_a + face_a]
-    b = states.face_corner[pose.corner_b + face_b]
+    a = trees.states.face_corner[pose.corner_a + face_a]
+    b = trees.states.face_corner[pose.corner_b + face_b]
     for k in range(3):
-        corner[k] = load_vertex(models.vertex_pos, a[k])
-        corner[3 + k] = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[k]))
+        corner[k] = load_vertex(trees.models.vertex_pos, a[k])
+        corner[3 + k] = pose_point(pose.rotation, pose.translation, load_vertex(trees.models.vertex_pos, b[k]))
 
 
 @wp.func
-def load_triangles(models: ModelPool, states: StatePool, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
+def load_triangles(trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
     """Return the corners of a face of A and of one of B, in A's frame."""
-    a = states.face_corner[pose.corner_a + face_a]
-    b = states.face_corner[pose.corner_b + face_b]
-    a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
+    a = trees.states.face_corner[pose.corner_a + face_a]
+    b = trees.states.face_corner[pose.corner_b + face_b]
+    a0, a1, a2, b0, b1, b2 = load_face_pair(trees.models, pose, a, b)
     return scale_triangles(a0, a1, a2, b0, b1, b2)
 
 

@@ -13,7 +13,7 @@ itself, d |n| by 2 u more. `GAP_ROUNDING` is 128 u. What underflows is under 2^-
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import reach_box, sum_products
 
@@ -153,7 +153,7 @@ def skew_of(r: wp.mat33d):
 
 
 @wp.func
-def pad_distance(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32, d: wp.float64):
+def pad_distance(trees: Trees, a: wp.int32, b: wp.int32, d: wp.float64):
     """Return the distance in A's frame, between A's vertices and B's x', beyond which two surfaces are over d apart.
 
     Over d in the world, and after any displacement of A's and B's points by e_a and e_b [model units], e_a + e_b = d.
@@ -163,17 +163,17 @@ def pad_distance(models: ModelPool, states: StatePool, objects: ObjectPool, a: w
     quaternion by 24 u, which moves p and q by 42 u (A + B), and the skew's own rounding of 4 u counts 21 u A: under
     192 u (A + B + T) in all. `POSE_ROUNDING` is 256 u.
     """
-    state_a = objects.state[a]
-    state_b = objects.state[b]
-    root_a = load_node(states, states.node_start[state_a] + 1)
-    root_b = load_node(states, states.node_start[state_b] + 1)
+    state_a = trees.objects.state[a]
+    state_b = trees.objects.state[b]
+    root_a = load_node(trees.states, trees.states.node_start[state_a] + 1)
+    root_b = load_node(trees.states, trees.states.node_start[state_b] + 1)
     reach_a = reach_box(root_a.lower, root_a.upper)
     reach_b = reach_box(root_b.lower, root_b.upper)
-    reach_a = reach_a + largest_coordinate(models.centre[states.model[state_a]])
-    reach_b = reach_b + largest_coordinate(models.centre[states.model[state_b]])
-    shift = largest_coordinate(objects.position[b] - objects.position[a])
-    skew_a = skew_of(objects.rotation[a])
-    skew_b = skew_of(objects.rotation[b])
+    reach_a = reach_a + largest_coordinate(trees.models.centre[trees.states.model[state_a]])
+    reach_b = reach_b + largest_coordinate(trees.models.centre[trees.states.model[state_b]])
+    shift = largest_coordinate(trees.objects.position[b] - trees.objects.position[a])
+    skew_a = skew_of(trees.objects.rotation[a])
+    skew_b = skew_of(trees.objects.rotation[b])
     two = wp.float64(2.0)
     padded = d * (wp.float64(1.0) + two * (skew_a + skew_b) + POSE_ROUNDING)
     return padded + wp.float64(6.0) * skew_a * reach_a + POSE_ROUNDING * (reach_a + reach_b + shift)

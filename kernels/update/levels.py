@@ -16,17 +16,14 @@ class Levels:
     brought to the level.
     """
 
-    # static
     object_model: wp.array(dtype=wp.int32)  # shape [object]
     start: wp.array(dtype=wp.int32)  # where the levels of each model begin, by rising LOD, shape [model + 1]
     lod: wp.array(dtype=wp.int32)  # shape [level]
     state: wp.array(dtype=wp.int32)  # tree state that serves a level, -1 where objects have their own, shape [level]
-    # state
     level: wp.array(dtype=wp.int32)  # of each object, shape [object]
     direction: wp.array(dtype=wp.int32)  # of its last change: 1, -1, or 0 before the first, shape [object]
     count: wp.array(dtype=wp.int32)  # objects at each level, shape [level]
     state_lod: wp.array(dtype=wp.int32)  # LOD wanted of each tree state, shape [state]; [0] where none is brought to it
-    # out
     changed: wp.array(dtype=wp.int32)  # objects that changed level, and those that turned back, shape [2]
 
 

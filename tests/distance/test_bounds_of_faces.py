@@ -9,8 +9,8 @@ from oracles.triangle_distance import triangle_distance
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.base.arrays import Trees
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.distance.frame import make_scale, slack_of
 from warp_abtree.kernels.triangle.distance_bounds import bound_faces, three_points
 
@@ -80,16 +80,10 @@ def test_faces_far_from_the_middle_are_not_lost(device):
 
 @wp.kernel
 def slack_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    distances: wp.array2d(dtype=wp.float64),
-    slack_out: wp.array2d(dtype=wp.float64),
+    trees: Trees, batch: PairBatch, distances: wp.array2d(dtype=wp.float64), slack_out: wp.array2d(dtype=wp.float64)
 ):
     i = wp.tid()
-    frame = make_scale(models, states, objects, pair_poses[i], pairs[i][0], pairs[i][1])
+    frame = make_scale(trees, batch.poses[i], batch.pairs[i][0], batch.pairs[i][1])
     for k in range(distances.shape[1]):
         slack_out[i, k] = slack_of(frame, distances[i, k])
 
@@ -109,9 +103,7 @@ def test_slack_is_what_the_proof_adds_up(device):
     reach = np.abs(model.mesh_at(model.lod_max)[0]).max()
     size = 2 * reach + np.abs(poses[1::2, :3] - poses[0::2, :3]).max(1)
     parts = 2.0 ** np.array([-60, -30, -19, -17.0])
-    slack = launch(
-        slack_kernel, device, count, *query.batch.pools, query.pairs, query.pair_poses, parts * size[:, None], columns=4
-    )
+    slack = launch(slack_kernel, device, count, query.batch.trees, query.pair_batch, parts * size[:, None], columns=4)
     unit = 2.0**-53 * size[:, None]
     assert (slack[:, :3] >= (90 + 256) * unit).all() and (slack[:, 3:] >= (90 + 96) * unit).all()
     # Rotations of quaternions are off orthonormal by some u; the rest is no more than twice what it need be.

@@ -7,14 +7,14 @@ from helpers.questions import launch
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.distance.frame import is_active
 
 
 @wp.kernel(module="unique")
-def is_active_kernel(models: ModelPool, states: StatePool, active_out: wp.array(dtype=wp.int32)):
+def is_active_kernel(trees: Trees, active_out: wp.array(dtype=wp.int32)):
     """Tell of each face of state 0, and of some beyond its last."""
-    active_out[wp.tid()] = wp.where(is_active(models, states, 0, wp.tid()), 1, 0)
+    active_out[wp.tid()] = wp.where(is_active(trees, 0, wp.tid()), 1, 0)
 
 
 def test_far_moves_cost_no_more_than_a_fresh_search():
@@ -48,7 +48,7 @@ def test_searches_never_start_from_faces_that_are_not_there(device):
     pairs, gone = np.arange(40).reshape(-1, 2), 0
     query = ab.DistanceQuery(scene, pairs)
     there = [np.isin(np.arange(model.face_count), model.mesh_at(lod)[2]) for model, lod in zip((ring, small), lods)]
-    active = launch(is_active_kernel, device, ring.face_count + 5, *scene.batch().pools[:2])
+    active = launch(is_active_kernel, device, ring.face_count + 5, scene.batch().trees)
     np.testing.assert_array_equal(active, [*there[0], *[False] * 5])
     # The last faces of other LODs: some of these are gone.
     for fractions in ((1.0, 1.0), (0.3, 0.3), (1.0, 0.3), (0.3, 0.3), (0.05, 1.0), (0.3, 0.3)):

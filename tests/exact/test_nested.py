@@ -172,7 +172,7 @@ def count_lost(query, count, margin_factor):
     memory = wp.zeros((1, slab_memory_words(0)), dtype=wp.float32, device=CPU)
     buffers = [wp.empty(length, dtype=wp.int64, device=CPU) for length in (CPU_STACK_LENGTH, WAITING_LENGTH)]
     met = wp.zeros(count, dtype=wp.int32, device=CPU)
-    inputs = [margin_factor, *query.batch.pools[:2], query.pair_poses, memory, *buffers, met]
+    inputs = [margin_factor, query.batch.models.pool, query.batch.states.pool, query.pair_poses, memory, *buffers, met]
     wp.launch(list_leaf_pairs_kernel, dim=1, inputs=inputs, device=CPU)
     return int((met.numpy() == 0).sum())
 

@@ -114,7 +114,7 @@ def count_lost(query, trees, levels, margin_factor):
     leaves = np.stack([tree.leaf_node for tree in trees], 1)
     nodes = wp.array(leaves >> levels, dtype=wp.vec2i, device=query.device)
     overlap = wp.zeros(len(nodes), dtype=wp.int32, device=query.device)
-    inputs = [margin_factor, *query.batch.pools[:2], query.pair_poses, nodes, overlap]
+    inputs = [margin_factor, query.batch.models.pool, query.batch.states.pool, query.pair_poses, nodes, overlap]
     wp.launch(compare_slabs_kernel, dim=len(nodes), inputs=inputs, device=query.device)
     return int((overlap.numpy() == 0).sum())
 

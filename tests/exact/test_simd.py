@@ -271,7 +271,7 @@ def test_descends_as_node_pair_tests_do(names):
         for way in [*ways, full] if case is cases[0] else ways:
             stack, faces = filled(CPU_STACK_LENGTH + 64), filled(WAITING_LENGTH + 64)
             found = wp.empty(10**7, dtype=wp.int64, device=CPU)
-            inputs = wp.vec3i(*way), query.batch.pools[1], query.pair_poses, stack, faces, found
+            inputs = wp.vec3i(*way), query.batch.states.pool, query.pair_poses, stack, faces, found
             count, compared, _ = ask_at_once(descend_kernel, *inputs)
             assert count == way[0] * result.triangle_tests[0] > 0
             if plain is None:

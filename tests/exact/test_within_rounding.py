@@ -13,7 +13,7 @@ from helpers.questions import ask, launch
 from helpers.samples import random_quaternions
 
 import warp_abtree as ab
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.boxes import boxes_overlap, pose_box
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import pair_pose
@@ -140,12 +140,12 @@ def test_distances_allow_for_frames_off_orthonormal(device, case):
 
 
 @wp.kernel
-def leaves_kernel(within: wp.float64, models: ModelPool, states: StatePool, objects: ObjectPool, out: wp.array[int]):
+def leaves_kernel(within: wp.float64, trees: Trees, out: wp.array[int]):
     """Compare the box of each of A's two faces with B's."""
     i = wp.tid()
-    pose = pair_pose(True, models, states, objects, 0, 1, within)
-    a = load_node(states, pose.node_a + 2 + i)
-    b = load_node(states, pose.node_b + 1)
+    pose = pair_pose(True, trees, 0, 1, within)
+    a = load_node(trees.states, pose.node_a + 2 + i)
+    b = load_node(trees.states, pose.node_b + 1)
     posed_a = pose_box(a.lower, a.upper, wp.transpose(pose.rotation32), pose.back32, pose.margin)
     posed_b = pose_box(b.lower, b.upper, pose.rotation32, pose.translation32, pose.margin)
     out[i] = wp.where(boxes_overlap(posed_a, posed_b), 1, 0)
@@ -157,9 +157,9 @@ def test_widened_boxes_allow_for_frames_off_orthonormal(device):
     scene = ab.Scene(device)
     scene.add(ab.Model.from_arrays(np.concatenate([1 - spread, spread - 1]), [[0, 1, 2], [3, 4, 5]]))
     scene.add(ab.Model.from_arrays(spread - 2.0**-21, FACE))
-    pools = scene.batch().pools
+    trees = scene.batch().trees
     third, across = np.ones(3) / np.sqrt(3.0), np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0)
     turn = np.stack([third, across, np.cross(third, across)], 1) * (1 + 2.0**-12)
-    pools[2].rotation.assign(np.stack([np.eye(3), turn]))
+    trees.objects.rotation.assign(np.stack([np.eye(3), turn]))
     for within, expected in ((math.sqrt(3.0), 1), (0.99 * math.sqrt(3.0), 0)):
-        assert launch(leaves_kernel, device, 2, within, *pools).tolist() == [expected] * 2
+        assert launch(leaves_kernel, device, 2, within, trees).tolist() == [expected] * 2

@@ -8,7 +8,7 @@ from helpers.questions import launch
 from oracles.path import HAS_LONG, LONG, apply, invert
 
 import warp_abtree as ab
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ObjectPool, Trees
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import place_trees
 from warp_abtree.kernels.motion.linear import (
@@ -35,27 +35,20 @@ class View:
 
 
 @wp.kernel(module="unique", module_options={"fuse_fp": False})
-def view_kernel(
-    ends: ObjectPool,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    times: wp.array(dtype=wp.float64),
-    view_out: wp.array(dtype=View),
-):
+def view_kernel(ends: ObjectPool, trees: Trees, times: wp.array(dtype=wp.float64), view_out: wp.array(dtype=View)):
     i = wp.tid()
     t, a, b, o = times[i], 2 * i, 2 * i + 1, wp.vec3()
-    pose = place_trees(models, states, objects.state[a], objects.state[b])
-    m = start_linear_motion(ends, models, states, objects, wp.vec2i(a, b))
-    m = bound_linear_motion(m, states, pose, pair_skew(objects, a, m.first))
+    pose = place_trees(trees, trees.objects.state[a], trees.objects.state[b])
+    m = start_linear_motion(ends, trees, wp.vec2i(a, b))
+    m = bound_linear_motion(m, trees.states, pose, pair_skew(trees.objects, a, m.first))
     speed = (m.way_b * m.centre_b + m.shift_b) - (m.way_a * m.centre_a + m.shift_a)
     shift = ((m.first * m.centre_b + m.offset) - m.centre_a) + t * speed
     at = image_of(wp.identity(n=3, dtype=wp.float64) + t * m.way_a, m.first + t * m.way_b, shift, m.scale)
     way = image_of(m.way_a, m.way_b, speed, m.scale)
     view = View()
     view.motion = m
-    view.box_a = see(load_node(states, pose.node_a + 1), m, at.a, o, way.a, o)
-    view.box_b = see(load_node(states, pose.node_b + 1), m, at.b, at.shift, way.b, way.shift)
+    view.box_a = see(load_node(trees.states, pose.node_a + 1), m, at.a, o, way.a, o)
+    view.box_b = see(load_node(trees.states, pose.node_b + 1), m, at.b, at.shift, way.b, way.shift)
     view_out[i] = view
 
 
@@ -72,15 +65,15 @@ class Case:
         for model, pose in zip(models, starts, strict=True):
             scene.add(model, pose)
         query = ab.FirstContactQuery(scene, ends, np.arange(len(models)).reshape(-1, 2), linear=True)
-        self.times, pools = rng.uniform(size=len(models) // 2), query.batch.pools
-        self.view = launch(view_kernel, device, len(self.times), query.ends, *pools, self.times)
+        self.times, trees = rng.uniform(size=len(models) // 2), query.batch.trees
+        self.view = launch(view_kernel, device, len(self.times), query.ends, trees, self.times)
         points = np.array([[*model.mesh_at(model.lod_max)[0], model.centre] for model in models])
         self.corners = points[0::2, :-1], points[1::2, :-1]
-        home = np.repeat(invert(pools[2].rotation.numpy().astype(LONG)[0::2]), 2, 0)
-        origin = np.repeat(pools[2].position.numpy().astype(LONG)[0::2], 2, 0)
+        home = np.repeat(invert(trees.objects.rotation.numpy().astype(LONG)[0::2]), 2, 0)
+        origin = np.repeat(trees.objects.position.numpy().astype(LONG)[0::2], 2, 0)
         first, last = (
             apply(home, apply(pool.rotation.numpy(), points) + (pool.position.numpy() - origin)[:, None])
-            for pool in (pools[2], query.ends)
+            for pool in (trees.objects, query.ends)
         )
         way = last - first
         now = first + np.repeat(self.times, 2).astype(LONG)[:, None, None] * way

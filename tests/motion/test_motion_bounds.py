@@ -12,7 +12,7 @@ from oracles.path import HAS_LONG, LONG, apply, frames_at, move, seen_from, shor
 from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
-from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import place_trees
 from warp_abtree.kernels.motion.node_pair import MovingBox, box_motion, move_box
@@ -44,25 +44,18 @@ class Seen:
 
 
 @wp.kernel(module="unique", module_options={"fuse_fp": False})
-def see_kernel(
-    paths: Paths,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    times: wp.array(dtype=wp.float64),
-    seen_out: wp.array(dtype=Seen),
-):
+def see_kernel(paths: Paths, trees: Trees, times: wp.array(dtype=wp.float64), seen_out: wp.array(dtype=Seen)):
     i = wp.tid()
     a, b = 2 * i, 2 * i + 1
-    pose = place_trees(models, states, objects.state[a], objects.state[b])
+    pose = place_trees(trees, trees.objects.state[a], trees.objects.state[b])
     seen = Seen()
-    motion = start_motion(paths, models, states, objects, wp.vec2i(a, b))
-    seen.motion = bound_motion(motion, states, pose, pair_skew(objects, a, motion.first))
+    motion = start_motion(paths, trees, wp.vec2i(a, b))
+    seen.motion = bound_motion(motion, trees.states, pose, pair_skew(trees.objects, a, motion.first))
     seen.b_in_a = place_motion(seen.motion, times[i])
     seen.a_in_b = reverse_moment(seen.b_in_a)
     boxes = box_motion(seen.motion, seen.b_in_a)
     home, spin = wp.transpose(boxes.rotation), wp.transpose(boxes.spin)
-    root_a, root_b = load_node(states, pose.node_a + 1), load_node(states, pose.node_b + 1)
+    root_a, root_b = load_node(trees.states, pose.node_a + 1), load_node(trees.states, pose.node_b + 1)
     seen.box_a = move_box(root_a, seen.motion, home, boxes.back, spin, boxes.back_speed)
     seen.box_b = move_box(root_b, seen.motion, boxes.rotation, boxes.shift, boxes.spin, boxes.speed)
     seen_out[i] = seen
@@ -81,18 +74,18 @@ class Case:
         for model, pose in zip(models, starts, strict=True):
             scene.add(model, pose)
         query, count = ab.FirstContactQuery(scene, ends, np.arange(len(models)).reshape(-1, 2)), len(models)
-        pools, paths = query.batch.pools, Paths()
+        trees, paths = query.batch.trees, Paths()
         for name in ("axis", "angle", "anchor", "start", "travel"):
             setattr(paths, name, wp.zeros(count, dtype=wp.float64 if name == "angle" else wp.vec3d, device=device))
-        wp.launch(prepare_path_kernel, count, [screw, pools[2], query.ends, paths], device=device)
+        wp.launch(prepare_path_kernel, count, [screw, trees.objects, query.ends, paths], device=device)
         self.times = rng.uniform(size=count // 2)
-        self.seen = launch(see_kernel, device, count // 2, paths, *pools, self.times)
+        self.seen = launch(see_kernel, device, count // 2, paths, trees, self.times)
         anchor, start, travel = (getattr(paths, name).numpy() for name in ("anchor", "start", "travel"))
         if not screw:
-            start, end = pools[2].position.numpy().astype(LONG), query.ends.position.numpy().astype(LONG)
+            start, end = trees.objects.position.numpy().astype(LONG), query.ends.position.numpy().astype(LONG)
             travel = end - start
         self.own_turns = paths.axis.numpy(), paths.angle.numpy()
-        self._frames = pools[2].rotation.numpy(), anchor, start, travel
+        self._frames = trees.objects.rotation.numpy(), anchor, start, travel
         boxes = np.array([model.mesh_at(model.lod_max)[0] for model in models])
         self.corners = boxes[0::2], boxes[1::2]
         self.find_truth(turns or self.own_turns)

@@ -326,10 +326,10 @@ class NewtonContacts(DeviceMemory):
             setattr(rigid, name, getattr(contacts, f"rigid_contact_{name}"))
         query, room = self.query, len(self._count)
         body_q = self._no_body if body_q is None else body_q
-        inputs = [query.pair_count, query.manifolds, self._count]
+        inputs = [query.pair_batch, query.manifolds, self._count]
         wp.launch(kernels.count_point_kernel, room, inputs, device=self.device)
         with wp.ScopedDevice(self.device):
             wp.utils.array_scan(self._count, self._end, inclusive=True)
         inputs = [self._first, self.model.shape_margin, self._ids, body_q, self.model.shape_body]
-        inputs += [query.pairs, query.manifolds, self._end, self._count, rigid]
+        inputs += [query.pair_batch, query.manifolds, self._end, self._count, rigid]
         wp.launch(kernels.write_contact_kernel, room, inputs, device=self.device)

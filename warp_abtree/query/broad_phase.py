@@ -115,7 +115,7 @@ class BroadPhase(DeviceMemory):
         return [self._make_boxes(launch), find]
 
     def _make_boxes(self, launch):
-        inputs = [*self.batch.pools, self.guard.record(), self.wide, self._reach, self.lower, self.upper]
+        inputs = [self.batch.trees, self.guard.record(), self.wide, self._reach, self.lower, self.upper]
         return launch(pose_box_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
 
     def count_found(self) -> int:

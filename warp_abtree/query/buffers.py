@@ -42,9 +42,7 @@ class QueryBuffers(DeviceMemory):
     broad_phase: BroadPhase | None
     hits: Any  # `Hits`
     near: Any
-    pairs: wp.array
-    pair_count: wp.array
-    pair_poses: wp.array
+    pair_batch: poses.PairBatch
     counts: wp.array  # rows: hits.count, then COUNTERS
     within: wp.array  # where asked
     contained: wp.array  # face of what is inside, where there are solids
@@ -57,6 +55,21 @@ class QueryBuffers(DeviceMemory):
     _regime: Regime
     _torn: bool
     _made_views: HostViews | None = None
+
+    @property
+    def pairs(self) -> wp.array:
+        """The pairs queried, device vec2i; as many as there is room for."""
+        return self.pair_batch.pairs
+
+    @property
+    def pair_count(self) -> wp.array:
+        """How many pairs there are, device int32 (1,)."""
+        return self.pair_batch.count
+
+    @property
+    def pair_poses(self) -> wp.array:
+        """The pose of each pair, device `PairPose`."""
+        return self.pair_batch.poses
 
     def uses_warps(self) -> bool:
         """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
@@ -168,7 +181,7 @@ class QueryBuffers(DeviceMemory):
 
     def _pair_arrays(self, room: int) -> list:
         """Return (owner, attribute, new array) of whatever has an entry a pair."""
-        made = [(self, "pair_poses", wp.empty(room, dtype=poses.PairPose, device=self.device))]
+        made = [(self.pair_batch, "poses", wp.empty(room, dtype=poses.PairPose, device=self.device))]
         made.append((self, "slab_memory", self._make_slab_memory(room)))
         for hits in (self.hits, self.near):
             if hits is not None:
@@ -198,7 +211,7 @@ class QueryBuffers(DeviceMemory):
     def _make_room(self, pairs) -> list:
         """Return (owner, attribute, new array) of a device list of pairs, and of whatever belongs to a pair."""
         check_pair_room(len(pairs))
-        made = [*self._pair_arrays(len(pairs)), (self, "pairs", pairs)]
+        made = [*self._pair_arrays(len(pairs)), (self.pair_batch, "pairs", pairs)]
         return made if self.broad_phase is None else made + self.broad_phase.make_room(pairs)
 
     def _take_pairs(self, pairs):

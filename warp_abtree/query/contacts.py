@@ -253,7 +253,7 @@ class ContactQuery(Query):
         return self.start, self._listed_totals, self._sums.span
 
     def _find(self, count: int):
-        posed = [*self.batch.pools, self.pairs, self.pair_poses]
+        posed = [self.batch.trees, self.pair_batch]
         proven = self.precision == "exact"
         inputs = [*posed, proven, self.start, self.faces, self._deferred, self.contacts]
         if self._gap is not None:
@@ -266,7 +266,7 @@ class ContactQuery(Query):
         step = LISTED_WARPS * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
         if self._gap is not None:
             if self.uses_warps():
-                inputs = [*self.batch.pools[:2], self.pair_poses, self.start, self.faces, self.contacts]
+                inputs = [*posed, self.start, self.faces, self.contacts]
                 self._launch_kernel(separation.find_separation_kernel, count, inputs, WARP_SIZE)
             inputs = [step, *posed, self.faces, self._near, not self.uses_warps(), self.contacts]
             self._launch_kernel(separation.find_near_contact_kernel, step, inputs, WARP_SIZE)
@@ -278,7 +278,7 @@ class ContactQuery(Query):
         room = len(self.pairs)
         count = self._chunk_count(count, room)
         start, contacts, sums, means = self.start, self.contacts, self._sums, self.pair_contacts
-        posed = [*self.batch.pools, self.pairs, self.pair_poses]
+        posed = [self.batch.trees, self.pair_batch]
         if not self.uses_warps():
             self._launch_kernel(simd.sum_pair_kernel, room, [*posed, start, self.faces, contacts, means])
             return

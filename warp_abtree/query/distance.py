@@ -170,7 +170,6 @@ class DistanceQuery(Query):
         self._slabs.due_count = wp.zeros(1, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity)
         refuse_signed(self._signed and pairs is None, self.batch.has_solid())
-        self._found.launched = self.guard.launched
         self._fit_slabs()
 
     def set_pairs(self, pairs, beyond=None):
@@ -283,12 +282,11 @@ class DistanceQuery(Query):
         with loading(self.device, [(kernel, WARP_SIZE) for kernel in CROSSING_KERNELS]):
             pass
         room, device = len(self.pairs), self.device
-        models, states, objects = self.batch.pools
-        inputs = [self._stack_length(), models, states, self.pair_count, self.pair_poses, self.hits, self._found]
+        posed = [self.batch.trees, self.pair_batch]
+        inputs = [self._stack_length(), *posed, self.hits, self._found]
         dim = room * (WARP_SIZE if device.is_cuda else 1)
         kernel = crossing.search_crossing_kernel
         search = launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=device)
-        posed = [models, states, objects, self.pair_count, self.pairs, self.pair_poses]
         inputs = [*posed, self._found, self.hits, self.distances]
         kernel = crossing.report_crossing_kernel
         return [search, launch(kernel, dim=room, inputs=inputs, block_dim=WARP_SIZE, device=device)]
@@ -296,13 +294,11 @@ class DistanceQuery(Query):
     def _make_inside(self, launch) -> list:
         """Make the launches of `_report_inside`."""
         solids: Any = self.batch.solids
-        posed = [*self.batch.pools, self.pair_count, self.pairs, self.pair_poses]
-        inputs = [*posed, self.guard.launched, self.hits, self.contained, self.distances]
+        inputs = [self.batch.trees, self.pair_batch, self.hits, self.contained, self.distances]
         made = [launch(report_contained_kernel, dim=len(self.pairs), inputs=inputs, device=self.device)]
         if self._signed:
-            models, states, *posed = posed
-            inputs = [self._stack_length(), models, states, solids.pool, *posed]
-            inputs += [self.guard.launched, self.hits, self.distances]
+            inputs = [self._stack_length(), self.batch.trees, solids.pool, self.pair_batch]
+            inputs += [self.hits, self.distances]
             dim = len(self.pairs) * (WARP_SIZE if self.device.is_cuda else 1)
             made.append(launch(find_depth_kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
         return made
@@ -327,10 +323,8 @@ class DistanceQuery(Query):
 
     def _make_distances(self, launch) -> list:
         """Make the launches that find distances, after the exact test, see `Commands.find`."""
-        models, states, objects = self.batch.pools
         room, lanes, device = len(self.pairs), WARP_SIZE if self.device.is_cuda else 1, self.device
-        posed = [models, states, objects, self.pair_count, self.pairs, self.pair_poses]
-        shared = [models, states, self.pair_count, self.pair_poses]
+        posed = [self.batch.trees, self.pair_batch]
         hits, found, length = self.hits, self._found, self._stack_length()
         threads = {"dim": room, "block_dim": WARP_SIZE, "device": device}
         reports = [self._tolerances, *posed, found, hits, self.distances]
@@ -338,21 +332,20 @@ class DistanceQuery(Query):
             made = []
             for steps in [(True, True)] if self._search_cores() == 1 else [(True, False), (False, True)]:
                 request = search_simd.SearchRequest()
-                request.pair_count, request.pairs, request.pair_poses = self.pair_count, self.pairs, self.pair_poses
                 request.tolerances, (request.refreshes, request.searches) = self._tolerances, steps
-                inputs = [request, models, states, objects, self.work.counter, self._slabs, found, hits]
+                inputs = [request, *posed, self.work.counter, self._slabs, found, hits]
                 inputs += [self.distances, self._memory]
                 made.append(launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device))
             return made
         started = {**threads, "dim": max(room, len(self.work.flag))}
-        inputs = [length, self._tolerances, *shared, self._slabs, found, hits, self.work]
+        inputs = [length, self._tolerances, *posed, self._slabs, found, hits, self.work]
         searching = {"dim": self._warp_count() * lanes, "block_dim": WARP_SIZE, "device": device}
         block = mean_slabs.SLAB_THREADS if self.device.is_cuda else 1
         blocks = self.device.sm_count if self.device.is_cuda else 1
         making = {"dim": blocks * block, "block_dim": mean_slabs.SLAB_THREADS, "device": device}
         return [
             launch(frame.start_distance_kernel, inputs=[*posed, self._slabs, found, self.work], **started),
-            launch(mean_slabs.make_slabs_kernel, inputs=[block, blocks, models, states, self._slabs], **making),
+            launch(mean_slabs.make_slabs_kernel, inputs=[block, blocks, self.batch.trees, self._slabs], **making),
             launch(search.search_warp_kernel, inputs=inputs, **searching),
             launch(report.report_distance_kernel, inputs=reports, **threads),
         ]

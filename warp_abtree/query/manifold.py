@@ -104,10 +104,9 @@ class ManifoldQuery(ContactQuery):
         self._sort(count)
         self._find(count)
         room = len(self.pairs)
-        pools = self.batch.pools
         start, rows, curves, contacts = self.start, self.faces, self.curves, self.contacts
         gap = self._no_gap if self._gap is None else self.hits.gap
-        posed = [*pools, self.pairs, self.pair_poses]
+        posed = [self.batch.trees, self.pair_batch]
         listed = self._deferred
         inputs = [start, rows, curves, self._order, self._key, listed.total, self._large.total]
         self._launch_kernel(loops.begin_loop_kernel, count, inputs)
@@ -117,11 +116,11 @@ class ManifoldQuery(ContactQuery):
             self._find_near(count, posed, gap)
         self._launch_kernel(loops.name_loop_kernel, count, [start, contacts, curves, self._order, self._key])
         self._sort_keys(count, 31)
-        inputs = [*pools, self.pairs, start, rows, contacts, self._order, curves]
+        inputs = [*posed, start, rows, contacts, self._order, curves]
         self._launch_kernel(loops.average_loop_kernel, -(-count // WARP_SIZE) * WARP_SIZE, inputs, WARP_SIZE)
         inputs = [*posed, gap, self._ordered_rows(), contacts, curves]
         self._launch_kernel(manifold.find_candidate_kernel, count, inputs)
-        self._spread_points([pools[2], self.pairs, gap, start])
+        self._spread_points([self.batch.objects.pool, self.pair_batch, gap, start])
         self._add_inside_points()
 
     def _ordered_rows(self):
@@ -145,7 +144,7 @@ class ManifoldQuery(ContactQuery):
         """Find the candidates of faces that are apart. Launches only."""
         both, contacts, listed, curves = self._ordered_rows(), self.contacts, self._deferred, self.curves
         warps, threads = (-(-count // share) for share in (int(near_points.CONTACTS_A_WARP), WARP_SIZE))
-        inputs = [*posed[2:], both, contacts, listed, curves]
+        inputs = [self.batch.objects.pool, self.pair_batch, both, contacts, listed, curves]
         self._launch_kernel(near_points.find_near_candidate_kernel, threads * WARP_SIZE, inputs, WARP_SIZE)
         inputs = [*posed, gap, both, contacts, listed, curves]
         self._launch_kernel(near_points.find_facing_candidate_kernel, count, inputs, WARP_SIZE)
@@ -154,9 +153,8 @@ class ManifoldQuery(ContactQuery):
     def _add_inside_points(self):
         """Add points of what is inside, where there are solids. Launches only."""
         if self.batch.solids is not None:
-            models, states, *posed = [*self.batch.pools, self.pair_count, self.pairs, self.pair_poses]
-            inputs = [self._stack_length(), models, states, self.batch.solids.pool, *posed]
-            inputs += [self.guard.launched, self.hits, self.manifolds]
+            inputs = [self._stack_length(), self.batch.trees, self.batch.solids.pool, self.pair_batch]
+            inputs += [self.hits, self.manifolds]
             self._launch_warps(inside_points.add_inside_point_kernel, len(self.pairs), inputs)
 
     def _sort_keys(self, count, bits):

@@ -11,6 +11,7 @@ from warp_abtree.checks.cpu_threads import cores_for, launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.base.lanes import WARP_SIZE
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.exact.predicates import EXACT
 from warp_abtree.kernels.inside.containment import find_contained_kernel
 from warp_abtree.kernels.intersect import dual_tree, face_pairs, near_faces, relative_pose, simd, uncertain_pairs
@@ -106,15 +107,17 @@ class Query(QueryReadout):
             self.device, batch.states.generation, batch.filter_generation if pairs is None else None
         )
         self.broad_phase: Any = None
+        self.pair_batch = asked = PairBatch()
+        asked.launched = self.guard.launched
         if pairs is None:
             self._excluded_count = len(batch.excluded)
             self.broad_phase = self._make_broad_phase(room.pairs, sort_pairs)
             self.broad_phase.guard = self.guard
             self.broad_phase.wide = 0.0 if within is None else 0.5 * float(within)
-            self.pairs, self.pair_count = self.broad_phase.pairs, self.broad_phase.pair_count
+            asked.pairs, asked.count = self.broad_phase.pairs, self.broad_phase.pair_count
         else:
-            self.pair_count = wp.zeros(1, dtype=wp.int32, device=self.device)
-            self.pairs = wp.empty(room.pairs or 0, dtype=wp.vec2i, device=self.device)
+            asked.count = wp.zeros(1, dtype=wp.int32, device=self.device)
+            asked.pairs = wp.empty(room.pairs or 0, dtype=wp.vec2i, device=self.device)
         self.hits = self._make_hits(self._gap is not None)
         self.near = None if within is None else self._make_hits()
         self.work = self._make_work()
@@ -166,7 +169,7 @@ class Query(QueryReadout):
 
     def _add_reaches(self):
         if self._reach is not None and len(self.pairs):
-            inputs = [self.pair_count, self.pairs, self._reach, self.hits.gap]
+            inputs = [self.pair_batch, self._reach, self.hits.gap]
             self._repeat((), near_faces.add_reach_kernel, len(self.pairs), inputs)
 
     def finish(self, count: int | None = None):
@@ -218,20 +221,19 @@ class Query(QueryReadout):
 
     def _make_search(self, within, hits, mode, output, launch) -> list:
         """Make the launches that bring relative poses and traverse all pairs, see `Commands.find`."""
-        pools, room = self.batch.pools, len(self.pairs)
+        room = len(self.pairs)
         if not self.uses_warps():
             return self._make_threads(within, hits, mode, output, launch)
         self.work.warps = self._warp_count()
-        inputs = [output, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
+        inputs = [output, self.batch.trees, within, self.pair_batch, hits, self.work]
         dim = max(room, len(self.work.flag))
         # A warp a block: few pairs lie on as many multiprocessors.
         kernel = relative_pose.relative_poses(len(within) > 0)
         first = launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
-        inputs = [output, *pools[:2], self.pair_count, self.pair_poses]
         traversal = launch(
             dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),
             dim=self._warp_count() * (WARP_SIZE if self.device.is_cuda else 1),
-            inputs=[self._stack_length(), *inputs, hits, self.work],
+            inputs=[self._stack_length(), output, self.batch.trees, self.pair_batch, hits, self.work],
             block_dim=WARP_SIZE,
             device=self.device,
         )
@@ -240,13 +242,11 @@ class Query(QueryReadout):
     def _make_threads(self, within, hits, mode, output, launch) -> list:
         """Make the launch in which a thread starts all pairs and traverses them, or one for each of the two."""
         made = []
-        for starts, only in [(True, False)] if self._traversal_cores() == 1 else [(True, True), (False, False)]:
-            started = relative_pose.Started()
-            started.pair_count, started.pair_poses, started.within = self.pair_count, self.pair_poses, within
-            started.only = only
-            if starts:
-                started.pairs = self.pairs
-            inputs = [output, *self.batch.pools, self._regime.plain_tests, started, self.slab_memory, hits, self.work]
+        for starts, traverses in [(True, True)] if self._traversal_cores() == 1 else [(True, False), (False, True)]:
+            steps = relative_pose.ThreadSteps()
+            steps.within, steps.starts, steps.traverses = within, starts, traverses
+            inputs = [output, self.batch.trees, self._regime.plain_tests, steps, self.pair_batch]
+            inputs += [self.slab_memory, hits, self.work]
             made.append(launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=self.device))
         return made
 
@@ -284,12 +284,10 @@ class Query(QueryReadout):
 
     def _make_contained(self, launch) -> list:
         solids: Any = self.batch.solids
-        launched = self.guard.launched
         near = wp.empty(0, dtype=wp.int32, device=self.device) if self.near is None else self.near.any_hit
-        posed = [*self.batch.pools, self.pair_count, self.pairs, self.pair_poses]
-        inputs = [*posed, solids.pool, launched, self.hits, near, self.contained]
+        inputs = [self.batch.trees, self.pair_batch, solids.pool, self.hits, near, self.contained]
         dim = {"dim": len(self.pairs), "block_dim": WARP_SIZE, "device": self.device}
-        return [solids.prepare(launch, launched), launch(find_contained_kernel, inputs=inputs, **dim)]
+        return [solids.prepare(launch, self.guard.launched), launch(find_contained_kernel, inputs=inputs, **dim)]
 
     def _make_traversal(self, launch) -> list:
         """Make the launches of the narrow phase."""
@@ -298,12 +296,11 @@ class Query(QueryReadout):
         if self._gap is not None:
             within = self.hits.gap
         made = self._make_search(within, self.hits, mode, output, launch)
-        models, states, _ = self.batch.pools
         passes = _passes(self.precision, self._asked_gap is not None) if len(self.hits.uncertain) else ()
         for kernel, warps, block in passes:
             threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
             given = [] if kernel is near_faces.find_near_kernel else [output]
-            inputs = [threads, *given, models, states, self.pair_poses, self.hits]
+            inputs = [threads, *given, self.batch.trees, self.pair_batch, self.hits]
             made.append(launch(kernel, dim=threads, inputs=inputs, block_dim=block, device=self.device))
         return made
 

@@ -195,9 +195,8 @@ class QueryReadout(QueryBuffers):
             words = staging.room("words", self._block_length(n), wp.int64)
         words.zero_()
         near = staging.no_flags if self.near is None else self.near.any_hit
-        pairs = staging.no_pairs if self.broad_phase is None else self.pairs
         threads = max(1, -(-len(self.pairs) // kernels.BLOCK_DIM)) * kernels.BLOCK_DIM
-        inputs = [n, self.hits, near, self.pair_count, self.guard.launched, pairs, words]
+        inputs = [n, self.broad_phase is not None, self.pair_batch, self.hits, near, words]
 
         self._repeat((n, words.ptr), kernels.pack_pair_kernel, threads, inputs, kernels.BLOCK_DIM)
         return words

@@ -124,7 +124,7 @@ class Staging:
     def __init__(self, device):
         self.device = device
         self.pair_pool, self.row_pool = HostPool(device), HostPool(device)
-        self.no_flags, self.no_pairs = (wp.empty(0, dtype=dtype, device=device) for dtype in (wp.int32, wp.vec2i))
+        self.no_flags = wp.empty(0, dtype=wp.int32, device=device)
         self.words = self._packed = self.rows = self.order = self.key = self.start = self.no_flags
 
     def room(self, name: str, count: int, dtype) -> wp.array:

@@ -89,7 +89,7 @@ class SweptBroadPhase(BroadPhase):
 
     def _make_boxes(self, launch):
         query = self._query
-        inputs = [query.linear, query.screw, *self.batch.pools, query.ends, self.guard.record(), self.lower, self.upper]
+        inputs = [query.linear, query.screw, self.batch.trees, query.ends, self.guard.record(), self.lower, self.upper]
         return launch(start.sweep_box_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
 
 
@@ -126,7 +126,6 @@ class FirstContactQuery(Query):
         self.contacts, self.ends, self._motions = start.FirstContacts(), ObjectPool(), start.Motions()
         self.contacts.counter = wp.zeros(CONTACT_COUNTERS, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity, sort_pairs=True)
-        self.contacts.launched = self.guard.launched
         paths = path.Paths()
         for name in ("axis", "angle", "anchor", "start", "travel"):
             dtype = wp.float64 if name == "angle" else wp.vec3d
@@ -219,21 +218,20 @@ class FirstContactQuery(Query):
         return self._commands.find_callables(name, self.guard.given(), self.device, make)
 
     def _make_motions(self, launch) -> list:
-        models, states, objects = self.batch.pools
+        objects = self.batch.objects.pool
         room, launch = len(self.pairs), partial(launch, device=self.device)
         inputs = [self.screw, objects, self.ends, self._motions.paths]
         paths = launch(path.prepare_path_kernel, dim=self.batch.object_count, inputs=inputs)
-        inputs = [models, states, objects, self._motions, self.pair_count, self.pairs, self.pair_poses]
-        inputs += [self.hits, self.contacts, self._motion]
+        inputs = [self.batch.trees, self._motions, self.pair_batch, self.hits, self.contacts, self._motion]
         return [paths, launch(start.contact_starter(self._kind), dim=room, inputs=inputs, block_dim=WARP_SIZE)]
 
     def _make_contacts(self, launch) -> list:
-        models, states, objects = self.batch.pools
+        objects = self.batch.objects.pool
         room, launch = len(self.pairs), partial(launch, device=self.device)
         poses = straight.EndPoses()
         poses.rotation, poses.position = objects.rotation, objects.position
         poses.end_rotation, poses.end_position = self.ends.rotation, self.ends.position
-        inputs = [self.tolerance, models, states, poses, self.pair_count, self.pair_poses, self._motion]
+        inputs = [self.tolerance, self.batch.trees, poses, self.pair_batch, self._motion]
         if self.uses_warps():
             dim = room * (WARP_SIZE if self.device.is_cuda else 1)
             inputs = [self._stack_length(), *inputs, self.hits, self.contacts]

@@ -165,8 +165,7 @@ class Pipeline(DeviceMemory):
         with self.query.guard.launching(self):
             self._set_objects()
             self.query.launch()
-            hits, launched = self.query.hits, self.query.guard.launched
-            inputs = [self.query.pair_count, hits, launched, self._demand]
+            inputs = [self.query.pair_batch, self.query.hits, self._demand]
             wp.launch(kernels.tally_demand_kernel, 1, inputs, device=self.device)
 
     def _set_objects(self):

@@ -28,14 +28,14 @@ class NearestQuery(DistanceQuery):
 
     def cut(self, query, gap, bodies):
         """Cut the gaps of a query's pairs, which there is room for; see `kernels.bodies.ahead`. Launches only."""
-        room, pools, chosen = len(query.pairs), self.batch.pools, self._chosen
+        room, trees, chosen = len(query.pairs), self.batch.trees, self._chosen
         given = query.guard.given()
         with self.guard.launching(self):
             self.pair_count.zero_()
-            inputs = [*pools, query.pair_count, query.pairs, gap, bodies, chosen]
+            inputs = [trees, query.pair_batch, gap, bodies, chosen]
             self._repeat(given, ahead.choose_fast_kernel, room, inputs)
             self.traverse()
-            self._repeat(given, ahead.cut_gap_kernel, room, [*pools, chosen, self.distances, bodies, gap])
+            self._repeat(given, ahead.cut_gap_kernel, room, [trees, chosen, self.distances, bodies, gap])
 
     def _find_contained(self):
         pass

@@ -70,16 +70,16 @@ class CertifiedMotions(FirstContactQuery):
             self._begin()
         self._is_begun = False
         super(FirstContactQuery, self).traverse()
-        found = [self.pair_count, self.pairs]
-        self._run(kernels.exempt_pair_kernel, room, [*found, self.hits, self._bodies, state])
+        found = self.pair_batch
+        self._run(kernels.exempt_pair_kernel, room, [found, self.hits, self._bodies, state])
         for mode in ROUNDS:
-            self._run(kernels.choose_pair_kernel, room, [*found, state, self.hits])
+            self._run(kernels.choose_pair_kernel, room, [found, state, self.hits])
             self.begin_motions()
             if mode <= kernels.MATCH:
-                inputs = [*found, self.contacts, self._bodies, state, self._motion]
+                inputs = [found, self.contacts, self._bodies, state, self._motion]
                 self._run(kernels.widen_motion_kernel, room, inputs)
             self.follow_motions()
-            inputs = [mode, *found, self._pool, self.hits, self.contacts, self._bodies, state]
+            inputs = [mode, found, self._pool, self.hits, self.contacts, self._bodies, state]
             self._run(kernels.cut_way_kernel, room, inputs)
             self._run(kernels.apply_cut_kernel, n, [self._pool, self._bodies, state])
             if self._is_settled():
@@ -101,7 +101,7 @@ class CertifiedMotions(FirstContactQuery):
         Args:
             velocity_change: What gravity changes velocities by in a step [world units/s].
         """
-        inputs = [wp.vec3d(*velocity_change), self.guard.launched, self.pair_count, self.hits, self._state]
+        inputs = [wp.vec3d(*velocity_change), self.pair_batch, self.hits, self._state]
         self._run(kernels.end_way_kernel, len(self.fraction), [*inputs, self._bodies, self._pool])
 
     def is_whole(self) -> bool:

@@ -168,8 +168,8 @@ class FrameStages:
         query, levels = self.query, None if self._levels is None else self._levels.levels
         count = self._nothing if levels is None else levels.count
         changed = self._no_changes if levels is None else levels.changed
-        found = [query.guard.launched, query.pair_count, query.pairs, query.hits]
-        inputs = [*found, self._marked(), changed, count, self._frames, self._tests, self._summary]
+        inputs = [query.pair_batch, query.hits, self._marked(), changed, count]
+        inputs += [self._frames, self._tests, self._summary]
         threads = max(len(query.pairs), len(self._marked()), len(count), 1)
         dim = -(-threads // WARP) * WARP
         wp.launch(words.summarise_frame_kernel, dim, inputs, device=self.device)

@@ -161,10 +161,9 @@ class Dynamics(RigidBodies):
         self._check_whole()
         n, room, query, bodies = len(self.mass), self._room, self.query, self.bodies
         fast = 2.0 * float(np.linalg.norm(self.gravity)) * dt
-        posed = [query.pairs, self._pool, query.manifolds]
+        posed = [query.pair_batch, self._pool, query.manifolds]
         with self._changing():
-            found = [query.guard.launched, query.pair_count, len(query.pairs), query.hits]
-            self._launch(body_kernels.judge_contacts_kernel, 1, [*found, bodies])
+            self._launch(body_kernels.judge_contacts_kernel, 1, [query.pair_batch, query.hits, bodies])
             inputs = [dt, wp.vec3d(*(dt * self.gravity)), self.targets, self._pool, bodies]
             self._launch(body_kernels.begin_step_kernel, n, inputs)
             shell = 0.0 if self.certified is None else SHELL
@@ -219,7 +218,7 @@ class Dynamics(RigidBodies):
 
     def _color_pairs(self):
         """Color the pairs in contact, and sort all pairs by color."""
-        room, found = self._room, [self.query.pairs, self.constraints.color, self.bodies]
+        room, found = self._room, [self.query.pair_batch, self.constraints.color, self.bodies]
         rounds, color = self._color_rounds, self.constraints.color
         for turn in range(COLOR_COUNT * rounds):
             self._launch(graph_coloring.bid_kernel, room, [turn, rounds, *found])
@@ -251,7 +250,7 @@ class Dynamics(RigidBodies):
 
     def _relax_colors(self, each, colors, rounds, threads):
         each.first_color, each.last_color, each.rounds, each.threads = colors[0], colors[-1], rounds, threads
-        arrays = [self._sorted_pair, self._sorted_color, self.query.pairs, self.query.manifolds]
+        arrays = [self._sorted_pair, self._sorted_color, self.query.pair_batch, self.query.manifolds]
         block = RELAX_THREADS if len(colors) == 1 else TAIL_THREADS
         self._launch(solve.relax_kernel, threads, [each, *arrays, self.constraints, self.bodies], block)
 

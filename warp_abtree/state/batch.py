@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.device_memory import DeviceMemory
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.generation import Generation
 from warp_abtree.state.lod_update import LodUpdate, replace_states, set_object_lods
@@ -49,6 +50,7 @@ class Batch(DeviceMemory):
         self.mean_faces = float(models.face_count[self.object_model].mean()) if len(self.object_model) else 1.0
         self.solids = SolidArrays(models, states, solid) if np.any(solid) else None
         self._retired = False
+        self._trees, self._trees_made = Trees(), ()
 
     @property
     def lods(self) -> np.ndarray:
@@ -85,9 +87,15 @@ class Batch(DeviceMemory):
         return pairs is None or len(pairs) == 0 or bool(self.solids.is_solid[pairs].any())
 
     @property
-    def pools(self) -> list:
-        """`ModelPool`, `StatePool` and `ObjectPool` for kernels."""
-        return [self.models.pool, self.states.pool, self.objects.pool]
+    def trees(self) -> Trees:
+        """`Trees` for kernels, of the arrays that are in use; a copy of their addresses, kept until they change."""
+        models, states, objects = self.models.pool, self.states.pool, self.objects.pool
+        made = self.states.generation.number, id(objects.state), id(models.node_slab)
+        if made != self._trees_made:
+            self._trees = trees = Trees()
+            trees.models, trees.states, trees.objects = models, states, objects
+            self._trees_made = made
+        return self._trees
 
     def with_own_states(self, follows_poses: bool = False) -> Batch:
         """Return a batch of the same models and objects, posed alike now or always, that has no tree state yet."""

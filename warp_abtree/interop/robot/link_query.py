@@ -89,12 +89,12 @@ class LinkPairs:
 
     def place(self):
         """Pose the parts of all configurations, and box all objects. Launches only."""
-        request, pools, device = self.request, self.batch.pools, self.device
+        request, device = self.request, self.device
         inputs = [request.chain, self.configurations, self.frames]
         wp.launch(forward.forward_kernel, self.active, inputs, device=device)
-        inputs = [request.around, request.parts.frame, self.frames, pools[2]]
+        inputs = [request.around, request.parts.frame, self.frames, self.batch.objects.pool]
         wp.launch(forward.place_part_kernel, (self.active, request.part_count), inputs, device=device)
-        inputs = [*pools, self.guard.record(), 0.0, self._no_reach, self.lower, self.upper]
+        inputs = [self.batch.trees, self.guard.record(), 0.0, self._no_reach, self.lower, self.upper]
         wp.launch(pose_box_kernel, request.around + self.active * request.part_count, inputs, device=device)
         if self.bvh is not None:
             self.bvh.rebuild()
@@ -178,7 +178,7 @@ class LinkHits(StagedQuery):
     def _note(self):
         near = self._no_near if self.near is None else self.near.any_hit
         links, request = self.links, self.request
-        inputs = [request.around, request.part_count, self.pair_count, self.pairs, self.hits, near, links.chunk]
+        inputs = [request.around, request.part_count, self.pair_batch, self.hits, near, links.chunk]
         inputs.append(self.demand)
         wp.launch(answers.note_hit_kernel, len(self.pairs), inputs, device=self.device)
 
@@ -218,7 +218,7 @@ class LinkDistances(DistanceQuery, StagedQuery):
         links, request = self.links, self.request
         nearest: Any = self.nearest
         nearest.winner.fill_(int(answers.NO_PAIR))
-        given = [request.around, request.part_count, self.pair_count, self.pairs]
+        given = [request.around, request.part_count, self.pair_batch]
         for kernel, inputs in (
             (answers.note_distance_kernel, [self.hits, self.distances, links.chunk, self.demand]),
             (answers.find_winner_kernel, [self.distances, links.chunk, nearest]),
