@@ -10,7 +10,7 @@ import warp as wp
 import warp_abtree as ab
 from helpers import scenes
 from warp_abtree.kernels.contacts.chunks import CHUNK
-from warp_abtree.query.contacts import VECTORS
+from warp_abtree.query.stages.contacts import VECTORS
 from warp_abtree.state.arrays import SLOT_COLUMNS
 
 PAIRS = np.array([(0, 1), (1, 2), (3, 1)])

@@ -9,7 +9,7 @@ from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.interop.collision_data import ContactData, DistanceData
 from warp_abtree.interop.placed_shapes import PlacedShapes, shape_of
-from warp_abtree.scene.poses import check_poses
+from warp_abtree.state.poses import check_poses
 
 EXTERNAL = "__external"  # trimesh's name for a mesh that is not in the manager
 FIRST_PAIRS = 64  # tested first if one collision is enough
@@ -33,7 +33,7 @@ class CollisionManager(DeviceMemory):
       one.
     * A contact is a pair of intersecting faces with their indices, also of convex meshes. Its depth is that of the pair
       of objects if one is a solid that holds points of the other: how far the deepest of these is from the surface
-      (`warp_abtree.query.distance`); else how deep the two faces are in one another. An object wholly inside a solid
+      (`warp_abtree.query.stages.distance`); else how deep the two faces are in one another. An object wholly inside a solid
       gives one contact, whose segment joins that deepest point and the surface.
     * Distances are negative where solids are deep in one another, by that depth, a lower bound of the penetration
       depth; 0 where surfaces merely intersect, infinite if there are no objects. They are exact to the rounding of

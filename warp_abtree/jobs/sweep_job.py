@@ -10,9 +10,9 @@ import numpy as np
 from warp_abtree.checks.arguments import to_numpy, whole_number
 from warp_abtree.model.model import Model
 from warp_abtree.query.request import check_request
-from warp_abtree.scene.poses import check_poses
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep import sweep
+from warp_abtree.state.poses import check_poses
 
 # Poses of a shard, and rows read at a time while a job is checked.
 READ_ROWS = SHARD = 65536

@@ -9,13 +9,13 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.kernels.io import pipeline as kernels
-from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import CapacityError, check_capacity
 from warp_abtree.query.result import Result
-from warp_abtree.scene.poses import QUATERNION_TOLERANCE
+from warp_abtree.query.stages.contacts import ContactQuery
+from warp_abtree.query.stages.intersect import Query
 from warp_abtree.state.device_update import NO_FAULTS, DeviceLodUpdate, LevelStates
 from warp_abtree.state.generation import STALE_GRAPH
+from warp_abtree.state.poses import QUATERNION_TOLERANCE
 
 
 def check_groups(groups, object_model) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import to_numpy
-from warp_abtree.scene.poses import check_poses, device_rows
+from warp_abtree.state.poses import check_poses, device_rows
 
 SCALARS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
 

@@ -11,8 +11,8 @@ from warp_abtree.checks.quaternions import quaternions_of
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.bodies import bodies as kernels
 from warp_abtree.model.model import Model
-from warp_abtree.scene.poses import check_poses, launch_place
 from warp_abtree.scene.scene import Scene
+from warp_abtree.state.poses import check_poses, launch_place
 
 FIRST_STEP = 1 / 60
 """Length of a step [s] before the first one is known."""

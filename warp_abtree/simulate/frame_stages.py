@@ -12,13 +12,13 @@ from warp_abtree.kernels.lod.ladder import WARP
 from warp_abtree.kernels.update import levels as level_kernels
 from warp_abtree.kernels.update import work_lists
 from warp_abtree.lod.controllers import Controller
-from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.narrow_phase import Query
-from warp_abtree.scene.poses import check_poses, launch_place
+from warp_abtree.query.stages.contacts import ContactQuery
+from warp_abtree.query.stages.intersect import Query
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame_row import LodColumns
 from warp_abtree.simulate.rigid_bodies import Dynamics
 from warp_abtree.state.device_update import LevelStates, shares_levels
+from warp_abtree.state.poses import check_poses, launch_place
 
 
 class FrameStages:

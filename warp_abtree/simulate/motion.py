@@ -7,7 +7,7 @@ import numpy as np
 
 from warp_abtree.checks.arguments import broadcast_rows
 from warp_abtree.checks.quaternions import multiply_quaternions, quaternions_about
-from warp_abtree.scene.poses import check_poses
+from warp_abtree.state.poses import check_poses
 
 
 def triangle_wave(phase) -> np.ndarray:

@@ -9,9 +9,9 @@ import warp as wp
 from warp_abtree.kernels.intersect.broad_phase import pose_box_kernel
 from warp_abtree.kernels.robot import answers, forward, link_pairs
 from warp_abtree.query.broad_phase import BroadPhase
-from warp_abtree.query.distance import DistanceQuery
-from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import Buffers
+from warp_abtree.query.stages.distance import DistanceQuery
+from warp_abtree.query.stages.intersect import Query
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
 

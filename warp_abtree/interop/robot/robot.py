@@ -25,7 +25,7 @@ from warp_abtree.interop.robot.surroundings import make_surroundings
 from warp_abtree.interop.robot.urdf import apply_srdf, read_urdf
 from warp_abtree.kernels.robot import forward
 from warp_abtree.model.model import Model
-from warp_abtree.query.distance import check_beyond
+from warp_abtree.query.stages.distance import check_beyond
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.batch import check_pairs
 

@@ -5,10 +5,10 @@ import warp as wp
 
 from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.model.model import Model
-from warp_abtree.scene.poses import check_poses
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.arrays import ObjectArrays
 from warp_abtree.state.batch import Batch
+from warp_abtree.state.poses import check_poses
 
 STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
