@@ -122,23 +122,24 @@ class Description:
 
     def make_chain(self, device) -> forward.Chain:
         """Return the frames as device arrays."""
-        chain, columns = forward.Chain(), {name: k for k, name in enumerate(self.joints)}
-        frames, origins = self.frames, np.array([frame.origin for frame in self.frames])
-
-        def upload(values, dtype):
-            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
-        chain.parent = upload(np.array([frame.parent for frame in frames], np.int32), wp.int32)
-        chain.kind = upload(np.array([JOINT_KINDS[frame.kind] for frame in frames], np.int32), wp.int32)
-        moved = [-1 if frame.joint is None else columns[frame.joint] for frame in frames]
-        chain.column = upload(np.array(moved, np.int32), wp.int32)
-        chain.scale = upload(np.array([frame.scale for frame in frames]), wp.float64)
-        chain.offset = upload(np.array([frame.offset for frame in frames]), wp.float64)
-        chain.axis = upload(np.array([frame.axis for frame in frames], np.float64), wp.vec3d)
-        chain.rotation = upload(origins[:, :3, :3], wp.mat33d)
-        chain.position = upload(origins[:, :3, 3], wp.vec3d)
-        limits = np.array(list(self.joints.values()), np.float64).reshape(-1, 2)
-        chain.lower, chain.upper = upload(limits[:, 0], wp.float64), upload(limits[:, 1], wp.float64)
+        columns, frames = {name: k for k, name in enumerate(self.joints)}, self.frames
+        origins, limits = np.array([frame.origin for frame in frames]), np.array([*self.joints.values()], np.float64)
+        lower, upper = limits.reshape(-1, 2).T
+        chain = forward.Chain()
+        for name, values in {
+            "parent": [frame.parent for frame in frames],
+            "kind": [JOINT_KINDS[frame.kind] for frame in frames],
+            "column": [-1 if frame.joint is None else columns[frame.joint] for frame in frames],
+            "scale": [frame.scale for frame in frames],
+            "offset": [frame.offset for frame in frames],
+            "axis": [frame.axis for frame in frames],
+            "rotation": origins[:, :3, :3],
+            "position": origins[:, :3, 3],
+            "lower": lower,
+            "upper": upper,
+        }.items():
+            dtype = forward.Chain.vars[name].type.dtype
+            setattr(chain, name, wp.array(np.ascontiguousarray(values), dtype=dtype, device=device))
         return chain
 
 
