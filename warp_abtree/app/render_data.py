@@ -67,11 +67,7 @@ def objects_of_world(worlds, world: int) -> np.ndarray:
 
 
 def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Settings) -> RenderData:
-    """Return what to draw.
-
-    Args:
-        shown: Indices of the objects that are shown, rising.
-    """
+    """Return what to draw of the objects that are shown, whose indices rise."""
     scene, result = cache.scene, snapshot.result
     inside = np.zeros(scene.object_count, bool)
     inside[shown] = True

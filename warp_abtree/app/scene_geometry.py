@@ -23,11 +23,7 @@ def place(poses, objects, points) -> np.ndarray:
 
 
 class MeshCache:
-    """Meshes of models at LODs; the least recently used are dropped when there are too many faces.
-
-    Args:
-        scene: `Scene`.
-    """
+    """Meshes of a scene's models at LODs; the least recently used are dropped when there are too many faces."""
 
     def __init__(self, scene: Scene):
         self.scene = scene

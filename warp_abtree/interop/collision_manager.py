@@ -79,8 +79,7 @@ class CollisionManager(DeviceMemory):
     def _pairs_with(self, guests):
         """Add guests for the duration of one call: name, `Shape` and matrix of each, or a manager that has them.
 
-        Yields:
-            Pairs of slots (own, guest), and a function of an index that returns the pair's names.
+        Yields pairs of slots (own, guest), and a function of an index that returns the pair's names.
         """
         if not isinstance(guests, list | CollisionManager):
             raise TypeError(f"other_manager is a {type(guests).__name__}, not a warp_abtree.CollisionManager")
@@ -281,11 +280,7 @@ class CollisionManager(DeviceMemory):
             return self._collide(pairs[kept], named, return_data, not (return_names or return_data))
 
     def _collide(self, pairs, names, return_data, first_only=False):
-        """Return whether any pair collides, names of those that do, and their contacts if requested.
-
-        Args:
-            first_only: Whether one collision is enough.
-        """
+        """Return whether any pair collides, or the first do, names of those that do, and contacts if requested."""
         if first_only and len(pairs) > FIRST_PAIRS:
             first = self._collide(pairs[:FIRST_PAIRS], names[:FIRST_PAIRS], return_data)
             return first if first[0] else self._collide(pairs[FIRST_PAIRS:], names[FIRST_PAIRS:], return_data)

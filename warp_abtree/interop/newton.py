@@ -80,10 +80,7 @@ def _excluded_pairs(model, shapes):
 
 
 def _other_pairs(model, is_mesh, collide):
-    """Return the pairs of shapes that collide and are not both meshes, (k, 2), sorted; k is linear in the meshes.
-
-    Newton's own list of pairs has all pairs of meshes too.
-    """
+    """Return the pairs of shapes that collide and are not both meshes, as Newton's own list has, (k, 2), sorted."""
     names = ("shape_body", "shape_collision_group", "shape_world")
     body, group, world = (np.asarray(getattr(model, name).numpy(), np.int64) for name in names)
     collide = collide & (group != 0)

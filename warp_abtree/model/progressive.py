@@ -154,14 +154,11 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None, cer
     powers of two. It stops early only where every further merge would kill the last face.
 
     Args:
-        base_faces: Stop when no more faces than this are left, >= 1.
         progress: Called as progress(stage, done, total) between launches; stages "collapse" and "LOD bounds".
         then: Called once, by another thread while the collapse goes on or after it.
         certify: Whether to certify the error of every LOD beside the collapse, not when it is first read.
 
     Raises ValueError where base_faces is no whole number from 1, or the mesh has 2^29 vertices or 2^31 / 3 faces.
-
-    Source: Garland and Heckbert 1997 (collapse).
     """
     whole_number(base_faces, "base_faces", 1, 2**62)
     vertices, faces = np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)

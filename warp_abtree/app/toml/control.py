@@ -27,8 +27,7 @@ class LodControl:
     def asked(self, controller: str | None = None, budget_ms: float | None = None) -> "LodControl":
         """Return this with another controller or budget; a budget alone asks the predictive one where none holds it.
 
-        Raises:
-            ValueError: A controller without its budget or tolerance.
+        Raises ValueError for a controller without its budget or tolerance.
         """
         if controller is None:
             keeps = budget_ms is None or self.controller in ("predictive", "paper")
@@ -56,11 +55,7 @@ class LodControl:
 
 
 def make_control(path, table) -> LodControl:
-    """Return what [lod] describes.
-
-    Raises:
-        SceneError: A controller without its budget or tolerance.
-    """
+    """Return what [lod] describes; raise SceneError for a controller without its budget or tolerance."""
     if table is None:
         return LodControl()
     from msgspec.structs import asdict

@@ -29,11 +29,7 @@ TOML_TYPES = {
 
 
 def import_msgspec(path):
-    """Return msgspec, which reads a file.
-
-    Raises:
-        SceneError: It is not installed.
-    """
+    """Return msgspec, which reads a file; raise SceneError where it is not installed."""
     try:
         import msgspec
     except ImportError:

@@ -7,6 +7,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.checks.device_memory import DeviceMemory
+from warp_abtree.checks.upload import struct_of
 from warp_abtree.interop.robot.link_query import LinkDistances, LinkHits, LinkRequest
 from warp_abtree.interop.robot.surroundings import RobotBatch
 from warp_abtree.kernels.robot.link_pairs import Parts
@@ -42,21 +43,17 @@ def make_link_request(robot, robots: RobotBatch, room: int) -> LinkRequest:
             stages.append((first, len(entries)))
     middles = [model.centre for model in robot.models]
     vertices = [model.progressive.vertex_pos[: model.progressive.vertex_count] for model in robot.models]
-    columns = np.array(entries, np.int32).reshape(-1, 3).T.copy()
-    parts = Parts()
-    for name, dtype, values in (
-        *((name, wp.int32, column) for name, column in zip(("first", "second", "shared"), columns)),
-        ("meets", wp.uint8, robots.meets.astype(np.uint8)),
-        ("frame", wp.int32, frame),
-        ("depth", wp.int32, [len(path) for path in paths]),
-        ("middle", wp.vec3d, np.array(middles)),
-        (
-            "radius",
-            wp.float64,
-            [np.sqrt(((v - m) ** 2).sum(1).max()) * (1 + 2.0**-40) for v, m in zip(vertices, middles)],
-        ),
-    ):
-        setattr(parts, name, wp.array(values, dtype=dtype, device=device))
+    columns = np.array(entries, np.int32).reshape(-1, 3).T
+    parts = struct_of(
+        Parts,
+        device,
+        **dict(zip(("first", "second", "shared"), columns)),
+        meets=robots.meets.astype(np.uint8),
+        frame=frame,
+        depth=[len(path) for path in paths],
+        middle=middles,
+        radius=[np.sqrt(((v - m) ** 2).sum(1).max()) * (1 + 2.0**-40) for v, m in zip(vertices, middles)],
+    )
     # A launch is one even where there is nothing to ask.
     return LinkRequest(description.make_chain(device), parts, stages or [(0, 0)], robots.count, room)
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.intersect.broad_phase import pose_box_kernel
 from warp_abtree.kernels.robot import answers, forward, link_pairs
 from warp_abtree.query.distance import DistanceQuery
@@ -50,19 +51,19 @@ class LinkQuery(Query):
     def _prepare(self, batch: Batch, request: LinkRequest, mode: int):
         """Make what launches need beside the query."""
         self.request, self.mode, self.active = request, mode, request.room
-        self.frames, self.chunk = frames, chunk = forward.Frames(), link_pairs.Chunk()
-        room, count = request.room, batch.object_count
-        rows, poses = (room, len(request.chain.lower)), (room, len(request.chain.parent))
+        device, room = batch.device, request.room
+        rows = room, len(request.chain.lower)
+        self.frames = zeros_of(forward.Frames, room, len(request.chain.parent), device)
         spread, within = (rows, room) if mode == link_pairs.ASK_WITHIN else ((0, 0), 0)
-        for owner, name, dtype, shape in (
-            *((self, "configurations", wp.float64, rows), (self, "demand", wp.int32, 2)),
-            *((self, "lower", wp.vec3, count), (self, "upper", wp.vec3, count)),
-            *((frames, "rotation", wp.mat33d, poses), (frames, "position", wp.vec3d, poses)),
-            *((chunk, "count", wp.int32, 1), (chunk, "hit", wp.uint8, room), (chunk, "near", wp.uint8, within)),
-            *((chunk, "half", wp.float64, spread), (chunk, "size", wp.float64, spread)),
-            (chunk, "best", wp.float64, room if mode == link_pairs.ASK_DISTANCE else 0),
-        ):
-            setattr(owner, name, wp.zeros(shape, dtype=dtype, device=batch.device))
+        most = room if mode == link_pairs.ASK_DISTANCE else 0
+        self.chunk = link_pairs.Chunk()
+        sizes: dict[str, Any] = dict(count=1, half=spread, size=spread, hit=room, near=within, best=most)
+        for name, shape in sizes.items():
+            dtype = link_pairs.Chunk.vars[name].type.dtype
+            setattr(self.chunk, name, wp.zeros(shape, dtype=dtype, device=device))
+        self.configurations = wp.zeros(rows, dtype=wp.float64, device=device)
+        self.demand = wp.zeros(2, dtype=wp.int32, device=device)
+        self.lower, self.upper = (wp.zeros(batch.object_count, dtype=wp.vec3, device=device) for _ in range(2))
         around = request.around
         self.bvh = wp.Bvh(self.lower[:around], self.upper[:around]) if around else None
 
@@ -146,9 +147,7 @@ class LinkDistances(DistanceQuery, LinkQuery):
 
     def __init__(self, batch: Batch, request: LinkRequest, capacity: int):
         self._prepare(batch, request, int(link_pairs.ASK_DISTANCE))
-        self.nearest = answers.NearestParts()
-        for name, variable in answers.NearestParts.vars.items():
-            setattr(self.nearest, name, wp.empty(request.room, dtype=variable.type.dtype, device=batch.device))
+        self.nearest = zeros_of(answers.NearestParts, request.room, 0, batch.device)
         super().__init__(batch, NO_PAIRS, Buffers(pairs=capacity))
 
     def _distances(self):
