@@ -65,12 +65,8 @@ class Playback:
 
     def modes(self) -> list[str]:
         """Return the modes of choosing LODs, as `choose` takes them."""
-        names = [name for name in CONTROLLERS if name != "none"]
-        return [
-            OWN_MODE,
-            HOLD_MODE,
-            *(name for name in names if name != "tolerance" or self.control.tolerance is not None),
-        ]
+        left_out = ("none",) if self.control.tolerance is not None else ("none", "tolerance")
+        return [OWN_MODE, HOLD_MODE, *(name for name in CONTROLLERS if name not in left_out)]
 
     def choose(self, mode, budget_ms=None):
         """Choose LODs in one of `modes`, by a budget [ms], None for the file's.
@@ -194,4 +190,4 @@ def _title(model) -> str:
 
 
 def _fraction_at(model, lod) -> float:
-    return len(model.mesh_at(lod)[2]) / model.face_count
+    return model.progressive.active_count(lod) / model.face_count

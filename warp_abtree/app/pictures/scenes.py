@@ -114,6 +114,6 @@ def _swept_title(scene, data, model) -> str:
     """Return the LODs at which a panel shows a swept model, and its faces."""
     keys = [geometry.split_key(key) for key in data.keys[data.shown]]
     lods = [lod for owner, lod in keys if scene.models[owner] is model]
-    faces = sum(len(model.mesh_at(lod)[2]) for lod in lods)
+    faces = sum(model.progressive.active_count(lod) for lod in lods)
     span = f"{min(lods):,}" if min(lods) == max(lods) else f"{min(lods):,} to {max(lods):,}"
     return f"{model.name} at LOD {span} of {model.lod_max:,}: {faces:,} faces"

@@ -1,18 +1,14 @@
 """The table [lod] of a scene file: the controller that chooses the LODs of a run."""
 
+import inspect
 from dataclasses import dataclass, field, replace
 
 from warp_abtree.app.toml.errors import fail
 from warp_abtree.lod.controllers import PaperController, PredictiveController, ToleranceController
 from warp_abtree.scene.scene import Scene
 
-CONTROLLERS = ("predictive", "paper", "tolerance", "none")
-# The options of [lod] that each controller takes.
-_OPTIONS = {
-    "predictive": ("steps", "spacing", "window", "aim", "low", "hold_frames", "loosest"),
-    "paper": ("steps", "window", "threshold_ms"),
-    "tolerance": ("steps", "spacing", "window", "loosest"),
-}
+_KINDS = {"predictive": PredictiveController, "paper": PaperController, "tolerance": ToleranceController}
+CONTROLLERS = (*_KINDS, "none")
 
 
 @dataclass(frozen=True)
@@ -47,11 +43,9 @@ class LodControl:
         """Return the controller for a scene, None for "none"."""
         if self.controller == "none":
             return None
-        options = {name: value for name, value in self.options.items() if name in _OPTIONS[self.controller]}
-        if self.controller == "tolerance":
-            return ToleranceController(scene, self.tolerance, camera, **options)
-        kind = PaperController if self.controller == "paper" else PredictiveController
-        return kind(scene, self.budget_ms, camera, **options)
+        kind, held = _KINDS[self.controller], self.tolerance if self.controller == "tolerance" else self.budget_ms
+        taken = inspect.signature(kind).parameters
+        return kind(scene, held, camera, **{name: value for name, value in self.options.items() if name in taken})
 
 
 def make_control(path, table) -> LodControl:
