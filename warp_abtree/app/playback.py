@@ -65,22 +65,13 @@ class Playback:
 
     def modes(self) -> list[str]:
         """Return the modes of choosing LODs, as `choose` takes them."""
-        names = [name for name in CONTROLLERS if name != "none"]
-        return [
-            OWN_MODE,
-            HOLD_MODE,
-            *(name for name in names if name != "tolerance" or self.control.tolerance is not None),
-        ]
+        left_out = ("none",) if self.control.tolerance is not None else ("none", "tolerance")
+        return [OWN_MODE, HOLD_MODE, *(name for name in CONTROLLERS if name not in left_out)]
 
     def choose(self, mode, budget_ms=None):
-        """Choose LODs in one of `modes`.
+        """Choose LODs in one of `modes`, by a budget [ms], None for the file's.
 
-        Args:
-            mode: "scene", "hold", or a controller.
-            budget_ms: T of a controller [ms]; None is the file's.
-
-        Raises:
-            ValueError: A controller without its budget, or another mode; the mode before is kept.
+        Raises ValueError for a controller without its budget, or another mode, and keeps the mode before.
         """
         if mode == HOLD_MODE:
             inner, self.chosen = None, self.scene.lods
@@ -114,11 +105,7 @@ class Playback:
         return Snapshot(self.number, self.time, self._poses.copy(), self.scene.lods, result, row)
 
     def step(self, output) -> Snapshot:
-        """Run the next frame. Waits for the device.
-
-        Args:
-            output: "count", "faces" or "contacts".
-        """
+        """Run the next frame, with output "count", "faces" or "contacts". Waits for the device."""
         self._frame.output = output
         result = self._frame.step()
         self.chosen, row = self.scene.lods, self._frame.history[-1]
@@ -203,4 +190,4 @@ def _title(model) -> str:
 
 
 def _fraction_at(model, lod) -> float:
-    return len(model.mesh_at(lod)[2]) / model.face_count
+    return model.progressive.active_count(lod) / model.face_count

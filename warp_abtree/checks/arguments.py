@@ -12,12 +12,8 @@ _started_in: int | None = None
 def check_device(device, what: str | None = None):
     """Refuse a device that cannot be used in this process, or where a graph is being captured.
 
-    Args:
-        what: A call that waits for the device or allocates, which no graph can capture; None for a launch.
-
-    Raises:
-        RuntimeError: The device is a GPU and the process was forked from one that had started Warp; or a graph is
-            being captured.
+    Raises RuntimeError for a GPU in a process forked from one that had started Warp; and while a graph is captured, if
+    `what` is a call that no graph can capture, as it waits for the device or allocates; None is a launch.
     """
     global _started_in
     if _started_in is None:
@@ -83,12 +79,9 @@ def is_device_array(values) -> bool:
 
 
 def to_numpy(values, what: str) -> np.ndarray:
-    """Return an array of any framework, or a sequence, as a NumPy array of real numbers.
+    """Return an array of any framework, or a sequence, as a NumPy array of real numbers; raise ValueError for another.
 
     What lies on a GPU is copied. (synchronization point)
-
-    Raises:
-        ValueError: It is no array of numbers.
     """
     try:
         if isinstance(values, list | tuple | np.ndarray):
@@ -115,11 +108,7 @@ def first_line(error) -> str:
 
 
 def whole_number(value, what: str, low: int, high: int) -> int:
-    """Return a whole number from low to high as int.
-
-    Raises:
-        ValueError: It is none, or outside.
-    """
+    """Return a whole number from low to high as int; raise ValueError for another value."""
     number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
     if not number or value != value or value in (float("inf"), float("-inf")) or int(value) != value:
         raise ValueError(f"{what} {value!r} is not a whole number")
@@ -129,11 +118,7 @@ def whole_number(value, what: str, low: int, high: int) -> int:
 
 
 def finite_array(values, what: str, shape: tuple) -> np.ndarray:
-    """Return finite numbers of a shape as float64.
-
-    Raises:
-        ValueError: Another shape, or a number that is not finite.
-    """
+    """Return finite numbers of a shape as float64; raise ValueError for another shape or number."""
     array = to_numpy(values, what).astype(np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         wanted = "a finite number" if shape == () else f"{' by '.join(map(str, shape))} finite numbers"
@@ -142,11 +127,7 @@ def finite_array(values, what: str, shape: tuple) -> np.ndarray:
 
 
 def positive(value, what: str) -> float:
-    """Return a finite number above 0 as float.
-
-    Raises:
-        ValueError: It is none.
-    """
+    """Return a finite number above 0 as float; raise ValueError for another value."""
     number = float(finite_array(value, what, ()))
     if not number > 0:
         raise ValueError(f"{what} {value!r} is not above 0")
@@ -154,22 +135,14 @@ def positive(value, what: str) -> float:
 
 
 def flag(value, what: str) -> bool:
-    """Return a bool as such.
-
-    Raises:
-        ValueError: It is none.
-    """
+    """Return a bool as such; raise ValueError for another value."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{what} {value!r} is neither True nor False")
     return bool(value)
 
 
 def broadcast_rows(values, what: str, shape: tuple) -> np.ndarray:
-    """Return a copy of numbers as float64, broadcast to a shape: one row, or number, serves all objects.
-
-    Raises:
-        ValueError: It does not broadcast.
-    """
+    """Return a float64 copy of numbers, broadcast to a shape: one row, or number, serves all; or raise ValueError."""
     values = np.asarray(values, np.float64)
     try:
         return np.broadcast_to(values, shape).copy()

@@ -60,11 +60,7 @@ def current_regime() -> Regime:
 
 
 def change_regime(**changes) -> Regime:
-    """Change choices from now on and return the regime before.
-
-    Raises:
-        TypeError: No such choice.
-    """
+    """Change choices from now on and return the regime before; raise TypeError for a name that is none."""
     global _current
     before, _current = _current, replace(_current, **changes)
     return before

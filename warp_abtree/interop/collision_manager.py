@@ -33,7 +33,7 @@ class CollisionManager(DeviceMemory):
       one.
     * A contact is a pair of intersecting faces with their indices, also of convex meshes. Its depth is that of the pair
       of objects if one is a solid that holds points of the other: how far the deepest of these is from the surface
-      (`warp_abtree.query.stages.distance`); else how deep the two faces are in one another. An object wholly inside a solid
+      (`query.stages.distance`); else how deep the two faces are in one another. An object wholly inside a solid
       gives one contact, whose segment joins that deepest point and the surface.
     * Distances are negative where solids are deep in one another, by that depth, a lower bound of the penetration
       depth; 0 where surfaces merely intersect, infinite if there are no objects. They are exact to the rounding of
@@ -79,8 +79,7 @@ class CollisionManager(DeviceMemory):
     def _pairs_with(self, guests):
         """Add guests for the duration of one call: name, `Shape` and matrix of each, or a manager that has them.
 
-        Yields:
-            Pairs of slots (own, guest), and a function of an index that returns the pair's names.
+        Yields pairs of slots (own, guest), and a function of an index that returns the pair's names.
         """
         if not isinstance(guests, list | CollisionManager):
             raise TypeError(f"other_manager is a {type(guests).__name__}, not a warp_abtree.CollisionManager")
@@ -281,11 +280,7 @@ class CollisionManager(DeviceMemory):
             return self._collide(pairs[kept], named, return_data, not (return_names or return_data))
 
     def _collide(self, pairs, names, return_data, first_only=False):
-        """Return whether any pair collides, names of those that do, and their contacts if requested.
-
-        Args:
-            first_only: Whether one collision is enough.
-        """
+        """Return whether any pair collides, or the first do, names of those that do, and contacts if requested."""
         if first_only and len(pairs) > FIRST_PAIRS:
             first = self._collide(pairs[:FIRST_PAIRS], names[:FIRST_PAIRS], return_data)
             return first if first[0] else self._collide(pairs[FIRST_PAIRS:], names[FIRST_PAIRS:], return_data)

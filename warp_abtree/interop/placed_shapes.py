@@ -58,12 +58,8 @@ def shape_of(mesh, name) -> Shape:
 class PlacedShapes:
     """Posed shapes; the slot of a removed one is reused for the next of the same mesh: models stay on the device.
 
-    Args:
-        device: Warp device.
-        solids: Whether closed shapes are solids.
-
     Attributes:
-        scene: `Scene` with one object per slot.
+        scene: `Scene` with one object per slot; closed shapes are solids where asked.
         shapes: `Shape` of each slot.
         poses: Matrices of the slots [world units], float64 (at least as many as slots, 4, 4).
     """

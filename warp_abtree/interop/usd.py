@@ -17,10 +17,8 @@ def read_usd(path, remarks):
     """Return a stage at its first time as a trimesh.Scene, with the prim's path for the name of each node.
 
     Prims that are geometry but cannot be read, are invisible, or of another purpose than default or render, are left
-    out; subdivision is not carried out, and skins are taken at rest. The `Remarks` name all of these.
-
-    Raises:
-        MeshError: usd-core is missing, the file cannot be read, or a mesh is damaged.
+    out; subdivision is not carried out, and skins are taken at rest. The `Remarks` name all of these. Raises MeshError
+    where usd-core is missing, the file cannot be read, or a mesh is damaged.
     """
     try:
         from pxr import Tf, Usd
@@ -58,12 +56,7 @@ class _StageReader:
         self._known: dict[tuple, str] = {}
 
     def visit(self, root, prefix, transform_of):
-        """Add what lies under a prim.
-
-        Args:
-            prefix: Of the names of nodes.
-            transform_of: Returns where a prim is in the world, a matrix of USD.
-        """
+        """Add what lies under a prim, nodes named with a prefix, where `transform_of` each is, a matrix of USD."""
         from pxr import Usd, UsdGeom
 
         prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies()))

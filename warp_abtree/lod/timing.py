@@ -95,8 +95,7 @@ class Timer:
     def mark(self, stage: str, count=dict):
         """End a part of a stage, which may have several. (synchronization point without events)
 
-        Args:
-            count: Returns the counted work of that part by name; called for a clock that takes it.
+        `count` returns the counted work of that part by name; it is called for a clock that takes it.
         """
         if self.device.is_capturing and not self.uses_events:
             return

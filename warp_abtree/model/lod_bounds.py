@@ -24,9 +24,7 @@ ERROR_KERNELS = [(hausdorff_bound.replay_merges_kernel, 1)]
 def certify_errors(vertices, faces, parent, merged):
     """Return the certified errors of all LODs [model units], float64 [m+1], of a forest and the positions it merges to.
 
-    Args:
-        parent: vertex_parent int32 [n_v+m].
-        merged: Positions of the nodes that merges make [model units], float64 [m, 3].
+    The forest is vertex_parent, int32 [n_v+m]; positions of the nodes that merges make [model units], float64 [m, 3].
     """
     with loading(wp.get_device("cpu"), ERROR_KERNELS):
         bounds = LodBounds(vertices, faces)

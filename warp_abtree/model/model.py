@@ -247,11 +247,7 @@ def _build(mesh, base_faces, progress, key, certify) -> Model:
 
 
 def _read(path, more=(), error_key=None) -> Model:
-    """Read a model file with more arrays, and check all of it; errors that it lacks lie in the cache by a key.
-
-    Raises:
-        ModelError: As `Model.open`.
-    """
+    """Read a model file with more arrays, and check all of it, as `Model.open`; the cache may have its errors."""
     names = (*_ARRAYS, *more, "leaf_node", "name")
     if path.is_dir() or (path.exists() and not path.is_file()):
         raise ModelError(f"{path}: is no regular file")

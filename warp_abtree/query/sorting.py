@@ -69,6 +69,31 @@ def segment_threads(count: int, pair_room: int, chosen: bool | None) -> int:
     return threads if chosen and count < 2**30 else 0
 
 
+def make_segment_sort(hits, count: int, threads: int, key, rows, ends, launch) -> list:
+    """Return what `launch` makes of the kernels that sort the first hits by a segment a pair, with so many threads.
+
+    Args:
+        hits: `Hits` whose face pairs are sorted.
+        key, rows: As for `HitSort.launch`.
+        ends: Device int32 (pair room + 1,), for where the hits of each pair start; int32 (1,), which becomes 0, and
+            vec3i for `ChunkSums.span`, or (0,).
+        launch: Takes what `wp.launch` does.
+    """
+    start, deferred, span = ends
+    device, block, room = key.device, sort_segments.SEGMENT_THREADS, len(start) - 1
+    lanes, group = (block, threads) if device.is_cuda else (1, 1)
+    blocks = -(-room // block), -(-room * group // lanes)
+
+    def make(kernel, dim, inputs):
+        return launch(kernel, dim=dim, inputs=inputs, device=device, block_dim=block)
+
+    inputs = [lanes, count, hits.total, hits.count, hits.face, start, deferred]
+    made = [make(sort_segments.start_segment_kernel, blocks[0] * lanes, inputs)]
+    made.append(make(sort_segments.take_place_kernel, count, [count, hits.total, hits.face, start, key]))
+    inputs = [threads // group, threads, start, key, rows, span]
+    return [*made, make(sort_segments.sort_segment_kernel, blocks[1] * lanes, inputs)]
+
+
 class HitSort:
     """Sort of an operator's hits on the device: by a segment a pair where pairs have few, else by radix.
 
@@ -101,7 +126,9 @@ class HitSort:
                 start = first_rows(staging.room("start", room + 1, wp.int32), room + 1)
                 ends, given = (start, *self._none[1:]), (*given, start.ptr)
             for launch in operator.find_launches(
-                "segments", lambda launch: self._make_segments(count, threads, key, rows, ends, launch), *given
+                "segments",
+                lambda launch: make_segment_sort(operator.hits, count, threads, key, rows, ends, launch),
+                *given,
             ):
                 launch()
             return True
@@ -129,24 +156,3 @@ class HitSort:
             made.append(launch(sort_hits.make_key_kernel, count, inputs, device=device))
         inputs = [count, sum(passes[-1][1:]), hits.total, hits.face, order, key, rows, start, totals]
         return [*made, launch(sort_hits.place_row_kernel, max(count, len(start)), inputs, device=device)]
-
-    def _make_segments(self, count, threads, key, rows, ends, launch) -> list:
-        """Return what `launch` makes of the kernels that sort by a segment a pair, with so many threads each."""
-        start, deferred, span = ends
-        hits, device, block, room = (
-            self.operator.hits,
-            self.operator.device,
-            sort_segments.SEGMENT_THREADS,
-            len(start) - 1,
-        )
-        lanes, group = (block, threads) if device.is_cuda else (1, 1)
-        blocks = -(-room // block), -(-room * group // lanes)
-
-        def make(kernel, dim, inputs):
-            return launch(kernel, dim=dim, inputs=inputs, device=device, block_dim=block)
-
-        inputs = [lanes, count, hits.total, hits.count, hits.face, start, deferred]
-        made = [make(sort_segments.start_segment_kernel, blocks[0] * lanes, inputs)]
-        made.append(make(sort_segments.take_place_kernel, count, [count, hits.total, hits.face, start, key]))
-        inputs = [threads // group, threads, start, key, rows, span]
-        return [*made, make(sort_segments.sort_segment_kernel, blocks[1] * lanes, inputs)]

@@ -23,7 +23,7 @@ class Rooms(NamedTuple):
 
 
 class Array(NamedTuple):
-    """Device array that a stage asks for: the attribute that holds it, its type and shape, and what is in it at first."""
+    """Device array that a stage asks for: the attribute that holds it, type and shape, and what is in it at first."""
 
     owner: Any  # a stage, or a Warp struct of its own
     name: str
@@ -94,7 +94,7 @@ class Stage:
         """Find what it finds of the pairs in place, of which there are some. Launches only."""
 
     def report(self, count: int | None):
-        """Compute further outputs of the hits, of which there are so many; None: as many as have room. Launches only."""
+        """Compute further outputs of so many hits; None: of as many as have room. Launches only."""
 
     def read(self, found: Found, device: bool, with_rows: bool):
         """Add its part to what was found, on the host or in arrays of the device, perhaps without rows of hits."""

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.checks.kernel_loading import loading, of_first_query
 from warp_abtree.kernels.base.nodes import clear_node_kernel
 from warp_abtree.kernels.intersect.broad_phase import pose_box_kernel
@@ -84,9 +85,9 @@ class KeptQueries:
         """Answer `Scene.intersect`."""
         given = check_options("intersect", SCENE_OPTIONS, output, precision, options)
         tolerances, signed, of_originals = check_distance_options(given)
-        distances = {name: given[name] for name in ("within", "gap", "beyond") if name in given}
+        distances = {name: to_numpy(given[name], name) for name in ("within", "gap", "beyond") if name in given}
         # One for all pairs widens the boxes of the broad phase.
-        ones = [float(check_within(value, name=name)) for name, value in distances.items() if np.ndim(value) == 0]
+        ones = [float(check_within(value, name=name)) for name, value in distances.items() if value.ndim == 0]
         reach, asked, found = max(ones, default=0.0), self._scene, pairs
         key = output, precision, of_originals, *sorted({*distances} - {"beyond"})
         if of_originals:

@@ -296,8 +296,8 @@ class Scene(DeviceMemory):
                 filtered out of the broad phase; None asks the broad phase for the pairs whose boxes overlap, or are no
                 farther apart than within, gap or beyond if that is one distance.
             output: "any", "count", "faces" or "contacts": each answers those before it too; what a contact is, and
-                an object pair's summary of them, stands in `warp_abtree.query.stages.contacts`. Or "distance": how far apart
-                the surfaces are, and where they are nearest, see `warp_abtree.query.stages.distance`.
+                an object pair's summary of them, stands in `query.stages.contacts`. Or "distance": how far apart
+                the surfaces are, and where they are nearest, see `query.stages.distance`.
             precision: "exact": the answer is exact for A's vertices and the posed ones of B, A the object with the
                 smaller index. "float32" takes the signs of rounded determinants.
             within: Distance d >= 0 [world units], or (p,) of them: `result.apart` tells the pairs whose posed surfaces,
@@ -308,7 +308,7 @@ class Scene(DeviceMemory):
             options: What one output alone takes, None as if not given. Of "distance": tolerance, relative and beyond,
                 when the search ends, and signed, whether depths of solids are negative distances, see `DistanceQuery`;
                 originals, whether it is that of the original meshes, whatever the LODs, see
-                `warp_abtree.query.stages.distance`. Of "contacts": gap, a distance [world units] or (p,) of them: faces nearer
+                `query.stages.distance`. Of "contacts": gap, a distance [world units] or (p,) of them: faces nearer
                 than that have contacts too, and all have a separation.
 
         Raises:
@@ -338,7 +338,7 @@ class Scene(DeviceMemory):
             device: As for `intersect`.
 
         Returns:
-            `Result` with time, clear and undecided; what they are stands in `warp_abtree.query.stages.first_contact`.
+            `Result` with time, clear and undecided; what they are stands in `query.stages.first_contact`.
 
         Raises:
             ValueError: Bad pairs, poses or tolerance, a scene without objects; an object of a pair that turns by half a

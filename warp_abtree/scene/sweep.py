@@ -341,8 +341,8 @@ def sweep(
         For "any" bool (p,), for "count" the intersecting face pairs of each pose, int64 (p,), for "faces" rows (pose,
         face of A, face of B), int32 (k, 3), sorted; with within, a structured array (p,) of any or count, and apart,
         whether the surfaces are proved farther apart. For "distance" a structured array (p,) of distance, bracket (2,),
-        points (2, 3) [A's frame] and faces (2,), see `warp_abtree.query.stages.distance`. For "first_contact" one of time,
-        clear and undecided, see `warp_abtree.query.stages.first_contact`.
+        points (2, 3) [A's frame] and faces (2,), see `query.stages.distance`. For "first_contact" one of time,
+        clear and undecided, see `query.stages.first_contact`.
 
     Raises:
         TypeError: model_a or model_b is no Model; an option has another name.

@@ -8,6 +8,7 @@ import warp as wp
 from warp_abtree.checks.arguments import broadcast_rows, finite_array, first_line
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.quaternions import quaternions_of
+from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.bodies import bodies as kernels
 from warp_abtree.model.model import Model
@@ -29,15 +30,6 @@ def object_mask(chosen, count):
             raise ValueError(f"kinematic: no indices of {count} objects, and no mask of them")
         mask[chosen] = True
     return mask
-
-
-def zeros_of(struct, rows, columns, device):
-    """Return a struct of device arrays that are 0: `rows` entries each, or rows and columns."""
-    made = struct()
-    for name, variable in struct.vars.items():
-        shape = rows if variable.type.ndim == 1 else (rows, columns)
-        setattr(made, name, wp.zeros(shape, dtype=variable.type.dtype, device=device))
-    return made
 
 
 @dataclass(frozen=True)
@@ -66,10 +58,8 @@ IMMOVABLE = MassProperties(np.inf, np.zeros(3), np.full(3, np.inf), np.eye(3), n
 def mass_properties(model: Model) -> MassProperties:
     """Return the mass properties of a model's original mesh, the same at every LOD.
 
-    A mesh that is not closed, not consistently wound, or without positive volume has those of its convex hull.
-
-    Raises:
-        ValueError: The mesh is flat, or its convex hull is needed and scipy or networkx is missing.
+    A mesh that is not closed, not consistently wound, or without positive volume has those of its convex hull. Raises
+    ValueError for a flat one, or where the hull is needed and scipy or networkx is missing.
     """
     import trimesh
 

@@ -91,12 +91,8 @@ class MotionRounds(FirstContact):
 class CertifiedMotions(Operator):
     """Fractions of the objects' motions towards their goals for which no two surfaces meet that were apart.
 
-    Pairs whose surfaces intersect at first do not count, nor do those without a rigid body.
-
-    Args:
-        scene: `Scene` whose poses are where motions start, and where `end` puts them.
-        bodies: `kernels.bodies.bodies.Bodies` of all objects.
-        capacity: `Buffers`: object pairs that there is room for at first.
+    Motions start at the poses of the scene, where `end` puts objects, too. Pairs whose surfaces intersect at first do
+    not count, nor do those without a rigid body.
 
     Attributes:
         goals: Poses that a step aims for, device arrays rotation and position of `kernels.base.arrays.ObjectPool`.
@@ -126,8 +122,7 @@ class CertifiedMotions(Operator):
     def end(self, velocity_change):
         """Pose objects where their motions end, unless there was no room for all pairs. Launches only.
 
-        Args:
-            velocity_change: What gravity changes velocities by in a step [world units/s].
+        `velocity_change` is what gravity changes velocities by in a step [world units/s].
         """
         inputs = [wp.vec3d(*velocity_change), self.pair_batch, self.hits, self._state]
         self._rounds.launch(kernels.end_way_kernel, len(self.fraction), [*inputs, self._bodies, self._pool])
@@ -147,12 +142,8 @@ class CertifiedMotions(Operator):
         return {"touching": touching, "undecided": undecided, "held": held}
 
     def check(self):
-        """Raise if there was no room for all pairs of the last step: then nothing moved. Waits for the device.
+        """Raise CapacityError if there was no room for all pairs of the last step: then nothing moved. Waits.
 
         Pairs that are undecided are no error, since their bodies wait where they are proved apart: see `pair_totals`.
-
-        Raises:
-            CapacityError: More pairs than there was room for.
-            RuntimeError: There was no step.
         """
         self.result().check()

@@ -24,11 +24,7 @@ class FrameFile:
         return self.path.suffix.lower() == ".json"
 
     def append(self, history: list[FrameRow]):
-        """Write the rows of a history that are not in the file yet.
-
-        Raises:
-            OSError: They cannot be written; the file holds those before.
-        """
+        """Write the rows that are not in the file yet; where that raises OSError, the file holds those before."""
         rows = [row.as_dict() for row in history[self._written :]]
         if not rows:
             return

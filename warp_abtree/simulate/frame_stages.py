@@ -25,11 +25,8 @@ class FrameStages:
     """Selection, LOD update, poses, broad and narrow phase, and the response of rigid bodies.
 
     Args:
-        scene: `Scene` with all its objects.
-        controller: `Controller` that selects LODs, or None.
-        dynamics: `Dynamics` that respond to contacts, or None.
+        controller, dynamics: What selects LODs, and what responds to contacts, or None.
         output: Output of the query where no dynamics ask for contacts.
-        time_step: Time between frames [s].
         moves: Whether anything sets poses.
 
     Attributes:
@@ -111,11 +108,7 @@ class FrameStages:
         return *self.query.guard.given(), *(() if certified is None else certified.guard.given())
 
     def check_rows(self, poses) -> np.ndarray:
-        """Return poses of all objects, (n, 7).
-
-        Raises:
-            ValueError: Bad poses, or another number of them.
-        """
+        """Return poses of all objects, (n, 7); raise ValueError for bad ones, or another number of them."""
         rows = check_poses(poses)
         if rows.shape != self._rows.shape:
             raise ValueError(f"motion: poses of shape {rows.shape}, not {self._rows.shape}")
@@ -202,11 +195,7 @@ class FrameStages:
         )
 
     def find(self, between=None):
-        """Query with room for all that is found. Waits for the device.
-
-        Args:
-            between: Called between broad and narrow phase.
-        """
+        """Query with room for all that is found; calls `between` after the broad phase. Waits for the device."""
         if self.dynamics is None:
             self.query.grow(between)
         else:

@@ -13,6 +13,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import finite_array, flag, positive
 from warp_abtree.checks.regime import current_regime
+from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.base.arrays import LAST_KEY
 from warp_abtree.kernels.bodies import bodies as body_kernels
 from warp_abtree.kernels.bodies import constraints as constraint_kernels
@@ -21,7 +22,7 @@ from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT
 from warp_abtree.query.request import Buffers, check_capacity
 from warp_abtree.query.stages.points import POINTS_MAX, ManifoldQuery
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.body_state import RigidBodies, zeros_of
+from warp_abtree.simulate.body_state import RigidBodies
 from warp_abtree.simulate.contacts_ahead import AheadGaps
 from warp_abtree.simulate.continuous import CertifiedMotions
 
@@ -258,10 +259,7 @@ class Dynamics(RigidBodies):
 class SteppedMotion:
     """Steps of `Dynamics` as the motion of a `Frame`: each frame finds the contacts once, and responds to them.
 
-    Args:
-        dynamics: `Dynamics`.
-        prescribed: `Kinematic`, or anything with its `poses`, for all objects: kinematic ones follow it. None leaves
-            them where they are.
+    Kinematic objects follow what is prescribed, `Kinematic` or anything with its `poses`, or stay where they are.
     """
 
     def __init__(self, dynamics: Dynamics, prescribed=None):

@@ -120,7 +120,7 @@ class Batch(DeviceMemory):
             update = LodUpdate(self.models, states, moves)
             for state, model in zip(ids, models, strict=True):
                 serving[self.object_model == model] = state
-            staged = self.objects.stage_states(serving, states.generation)
+            staged = self.objects.stage_states(serving, states)
             update.launch()
             self.objects.set_states(serving, staged)
         self._fit_solids()

@@ -18,13 +18,9 @@ SCENE_FACE_LIMIT = 2**22  # of all models of a file that are generated; a face t
 
 
 def check_faces(path: Path, tables: dict):
-    """Refuse models whose faces would exhaust the memory, before any is made.
+    """Refuse models, `ModelTable`s by name, whose faces would exhaust the memory, before any is made.
 
-    Args:
-        tables: `ModelTable`s by name.
-
-    Raises:
-        SceneError: Shapes, and meshes that are brought to a number of faces, have more than SCENE_FACE_LIMIT together.
+    Counted are shapes, and meshes that are brought to a number of faces: SCENE_FACE_LIMIT together.
     """
     total = 0
     for name, table in tables.items():
@@ -38,11 +34,7 @@ def check_faces(path: Path, tables: dict):
 
 
 def build_model(path: Path, name: str, table, progress=None) -> Model:
-    """Build the model that [models.NAME] describes.
-
-    Raises:
-        SceneError: A mesh is missing or bad, or its coordinates leave the range of numbers.
-    """
+    """Build the model that [models.NAME] describes; raise SceneError where its mesh is missing, bad or out of range."""
     mesh = _load(path, name, table)
     if mesh.parts > 1:
         about = f"the {mesh.parts} parts of {table.mesh} are joined into one mesh"

@@ -30,11 +30,7 @@ def add_arguments(sub: Parser):
 
 
 def import_viser():
-    """Return viser, silent.
-
-    Raises:
-        ValueError: It is not installed.
-    """
+    """Return viser, silent; raise ValueError where it is not installed."""
     try:
         import viser
     except ImportError as error:
@@ -45,11 +41,7 @@ def import_viser():
 
 
 def check_port(host, port):
-    """Refuse an address that cannot be served at.
-
-    Raises:
-        ValueError: No such address, no such port, or another program has it.
-    """
+    """Raise ValueError for no address, no port, or one that another program has."""
     if not 0 <= port <= 65535:
         raise ValueError(f"--port: {port} is outside 0 .. 65535")
     try:
@@ -93,11 +85,7 @@ def run_viewer(options, progress):
 
 
 def show(playback: Playback, host=HOST, port=None, as_json=False, seconds=None):
-    """Serve a page about a playback until Ctrl-C, or for a time [s]; print its address.
-
-    Raises:
-        ValueError: The address cannot be served at.
-    """
+    """Serve a page about a playback until Ctrl-C, or for a time [s]; print its address, or raise ValueError."""
     from warp_abtree.app.viewer.page import Page
 
     with serve(host, PORT if port is None else port) as server:

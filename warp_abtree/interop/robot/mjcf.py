@@ -227,8 +227,7 @@ def _shape(mujoco, model, g, where):
 def _recut(model, m, vertices, faces, where):
     """Return the faces of a mesh, those of an OBJ file with polygons cut anew: MuJoCo's may fold over.
 
-    Raises:
-        RobotError: MuJoCo has other vertices than the file.
+    Raises RobotError where MuJoCo has other vertices than the file.
     """
     start = int(model.mesh_pathadr[m])
     path = Path(model.paths[start : model.paths.index(b"\0", start)].decode() if start >= 0 else "")

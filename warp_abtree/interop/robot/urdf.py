@@ -151,8 +151,7 @@ def _add_link(name, description, joints, values, path):
 def _check_elements(path):
     """Refuse what yourdfpy mends or leaves out in silence, and warn of joints that it does not read.
 
-    Raises:
-        RobotError: A line that is no XML, another root, a geometry of other than one shape, a mesh of other than one.
+    Refused are lines that are no XML, another root, geometries of other than one shape, meshes of other than one.
     """
     from lxml import etree  # of yourdfpy
 
@@ -187,11 +186,7 @@ def _warn_of_unread(tags, path, level):
 
 
 def _find_file(name, where, path) -> Path:
-    """Return the file of a mesh, sought beside the robot's file and above: of a package with its folder, then without.
-
-    Raises:
-        RobotError: There is none.
-    """
+    """Find the file of a mesh beside the robot's file and above it: of a package with its folder and without."""
     given = (name or "").strip().replace("\\", "/")
     tails = [re.sub("^package:/+|^[a-z]+://", "", given)]
     if given.startswith(("package:", "model:")):
@@ -233,11 +228,7 @@ def _load_shape(geometry, where, path):
 
 
 def _unit_of(file: Path, where) -> float:
-    """Return the unit of a Collada file [m], 1 for files of other formats.
-
-    Raises:
-        RobotError: It is not positive.
-    """
+    """Return the unit of a Collada file [m], 1 for files of other formats; raise RobotError if it is not positive."""
     _, kind, zipped = split_file_name(file)
     if kind == "zae":
         raise RobotError(f"{where}: {file.name} is an archive; unpack the .dae of it")
@@ -265,10 +256,8 @@ def _sizes(given, count, where) -> np.ndarray:
 
 def apply_srdf(description: Description, path: Path, strict: bool):
     """Exclude and demand the pairs that an SRDF file does, as MoveIt: what it disables goes over what it enables, and
-    this over the links that it disables by default, whatever their order.
-
-    Raises:
-        RobotError: It is unreadable, or names a link that the robot has not and `strict` holds, which otherwise warns.
+    this over the links that it disables by default, whatever their order. A link that the robot has not is refused if
+    `strict`, else warned of.
     """
     try:
         root = ElementTree.parse(path).getroot()

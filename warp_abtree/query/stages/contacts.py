@@ -17,7 +17,7 @@ With `gap=d` face pairs that do not intersect, but are nearer than d, have conta
 and every contact has a separation: the widest gap that any direction leaves between the two closed triangles, the
 greatest of min n.b - max n.a over unit vectors n, a of the one and b of the other [world units].
 
-* Faces that do not intersect: their distance, above 0, computed as `warp_abtree.query.stages.distance` does. p0 and p1 are the
+* Faces that do not intersect: their distance, above 0, computed as `query.stages.distance` does. p0 and p1 are the
   nearest points, p0 on the first object's face: of a corner over a face the corner and its foot, of two edges where
   their common normal meets them, of parallel faces, edges or a shared plane one pair of equally near points. normal is
   the direction from p0 to p1: the face's normal under a corner, across both edges, else along neither. Where they are
@@ -54,7 +54,7 @@ contacts of each chunk of 32, the last chunk perhaps shorter, from left to right
   at distance d, less where the root boxes cap it; half of it for the tip of a cone. It is no depth, and no bound
   on one: where a curve runs over the edge of an object the mean normal leans over, and travel can be several times too
   large; for separate regions of contact, such as a peg in its hole, and for open surfaces it is merely a length. Depths
-  of solids are measured by `signed` distances (`warp_abtree.query.stages.distance`).
+  of solids are measured by `signed` distances (`query.stages.distance`).
 
 A pair without contacts has travel 0 and NaN as point and normal, of the bits 0x7ff8000000000000. The results are the
 same, bit for bit, on CPU and CUDA. For a pair named the other way the contacts differ in nothing but order, exchanged

@@ -11,7 +11,7 @@ names its objects:
   models and poses from `distance`, or within what the tolerance asks if that is more. (0, 0) where the surfaces
   intersect, (`beyond`, infinite) where they are proved farther apart.
 * points [world units]: the nearest points. Where the surfaces intersect, one point of both, twice: the middle of what
-  two faces share, as accurate as a contact (`warp_abtree.query.stages.contacts`).
+  two faces share, as accurate as a contact (`query.stages.contacts`).
 * point_faces: the faces that they lie on. Of equally near face pairs the one with the lowest face of the object with
   the smaller index, then of the other; where the surfaces intersect, some pair that does.
 
@@ -40,7 +40,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import check_device, flag, to_numpy
+from warp_abtree.checks.arguments import flag, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
@@ -279,7 +279,7 @@ class DistanceQuery(Operator):
     """Least distances of many object pairs as an operator: allocates once, launches many times.
 
     As `Query` otherwise. The faces that a launch finds are where the next one starts, so that objects which move little
-    from launch to launch take less time. What each answer is stands in `warp_abtree.query.stages.distance`.
+    from launch to launch take less time. What each answer is stands in `query.stages.distance`.
 
     Args:
         scene, pairs, capacity: As for `Query`. The broad phase finds overlapping boxes only.

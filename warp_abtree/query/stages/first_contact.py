@@ -197,7 +197,7 @@ class FirstContact(Stage):
 class FirstContactQuery(Operator):
     """Times of first contact of many object pairs as an operator: allocates once, launches many times.
 
-    As `Query` otherwise. What each answer is stands in `warp_abtree.query.stages.first_contact`.
+    As `Query` otherwise. What each answer is stands in `query.stages.first_contact`.
 
     Args:
         scene: As for `Query`: its poses at the time of each launch are where motions start.
