@@ -1,6 +1,7 @@
 """Checks of what a caller hands in: one clear error that names what and where, before anything is changed."""
 
 import os
+import sys
 
 import numpy as np
 import warp as wp
@@ -148,3 +149,11 @@ def broadcast_rows(values, what: str, shape: tuple) -> np.ndarray:
         return np.broadcast_to(values, shape).copy()
     except ValueError:
         raise ValueError(f"{what}: shape {values.shape} does not stretch to {shape}") from None
+
+
+def outer_level() -> int:
+    """Return the stacklevel by which a function of the library warns who called the library."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == "warp_abtree":
+        level, frame = level + 1, frame.f_back
+    return level

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line, whole_number
+from warp_abtree.checks.arguments import first_line, outer_level, whole_number
 from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.kernels.base.poses import COORDINATE_MIN
 from warp_abtree.model.cache import LEAST_FACES, error_key, file_key, find_model, keep_errors, keep_model, mesh_key
@@ -143,13 +143,13 @@ class Model:
         vertices = self.progressive.vertex_pos[: self.vertex_count]
         return find_winding(vertices, self.progressive.face_vertex, self.dropped_faces)
 
-    def warn_of_winding(self, why: str, stacklevel: int = 3):
-        """Warn where the winding is wrong, once a model, and say what depends on it."""
+    def warn_of_winding(self, why: str):
+        """Warn who called the library where the winding is wrong, once a model, and say what depends on it."""
         fault = self.winding.fault()
         if fault is not None and not self._warned:
             self._warned = True
             mend = "Model.load(orient=True) turns the faces"
-            warnings.warn(f"model {self.name!r}: {fault}; {why}; {mend}", RuntimeWarning, stacklevel=stacklevel)
+            warnings.warn(f"model {self.name!r}: {fault}; {why}; {mend}", RuntimeWarning, stacklevel=outer_level())
 
     @cached_property
     def digest(self) -> str:

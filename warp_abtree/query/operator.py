@@ -53,6 +53,8 @@ class Operator(DeviceMemory):
         batch, device, regime: What it is about, and where and how it launches.
         pair_batch: `PairBatch` of the pairs queried.
         hits: Device arrays of the last launch, `kernels.intersect.face_pairs.Hits`.
+        counts: Counters of `hits`, device int64; rows: count, then `COUNTERS`.
+        traversal: `Traversal` of the hits, which stages share.
         given: Pairs on the host, int32 (p, 2), unless the broad phase finds them.
         commands, guard: Its recorded launches, and what became of them.
         growth: Room that `run` makes, over the demand.
@@ -62,6 +64,9 @@ class Operator(DeviceMemory):
     broad_phase: Any = None
     near: Any = None
     hits: Any
+    counts: wp.array
+    traversal: Any
+    given: Any = None
 
     def __init__(self, scene, stages: list[Stage], pairs=None, capacity=None, output="any", sort_pairs=False):
         check_device(scene.device, f"making a {type(self).__name__}")
@@ -71,7 +76,8 @@ class Operator(DeviceMemory):
             self.batch = batch = scene if isinstance(scene, Batch) else scene.batch()
             if self.uses_warps() and self.regime.slabs:
                 batch.models.make_slabs()
-        self.given: Any = None if pairs is None else batch.check_pairs(pairs)
+        if pairs is not None:
+            self.given = batch.check_pairs(pairs)
         count = None if pairs is None else len(self.given)
         self._distances: dict[str, PairDistance] = {}
         for stage in stages:
@@ -105,7 +111,7 @@ class Operator(DeviceMemory):
         uncertain = (room.uncertain or UNCERTAIN_ROOM) if self.uses_warps() else 0
         hits = (room.hits or max(1024, 16 * places)) if output == "faces" else 0
         self.rooms = Rooms()
-        self.make_room(Rooms(places, hits, uncertain))
+        self.make_room(places, hits, uncertain)
         if pairs is not None:
             self.replace_pairs(self.given)
 
@@ -152,12 +158,14 @@ class Operator(DeviceMemory):
             made += [*found, (self.pair_batch, "pairs", pairs)]
         return made
 
-    def make_room(self, rooms: Rooms):
-        """Make room for other numbers of entries: for all of them, or nothing changes.
+    def make_room(self, pairs: int | None = None, hits: int | None = None, uncertain: int | None = None):
+        """Make room for other numbers of entries, None for those of before: for all, or nothing changes.
 
         Raises:
             CapacityError: More than there can be room for.
         """
+        asked = zip((pairs, hits, uncertain), self.rooms, strict=True)
+        rooms = Rooms(*(now if wanted is None else wanted for wanted, now in asked))
         made = self._make(rooms)
         with self.changing():
             self._replace(made, rooms)
@@ -166,7 +174,7 @@ class Operator(DeviceMemory):
 
     def resize(self, capacity: int):
         """Make room for a number of intersecting face pairs."""
-        self.make_room(self.rooms._replace(hits=capacity))
+        self.make_room(hits=capacity)
 
     def _replace(self, made: list, rooms: Rooms):
         """Put new arrays, (owner, attribute, array), in the place of old ones."""
@@ -221,8 +229,8 @@ class Operator(DeviceMemory):
         """Do what `ask_pairs` does, with pairs and distances that are checked; those left out stay."""
         self.check_whole()
         # What may fail for lack of memory comes before anything that changes the query.
-        rooms = self.rooms._replace(pairs=max(len(pairs), self.rooms.pairs))
-        made = self._make(rooms) if len(pairs) > self.rooms.pairs else []
+        rooms = Rooms(max(len(pairs), self.rooms.pairs), *self.rooms[1:])
+        made = self._make(rooms) if rooms != self.rooms else []
         with self.changing():
             if made:
                 self._replace(made, rooms)
@@ -237,7 +245,7 @@ class Operator(DeviceMemory):
         """Return whether pairs and distances, checked, None without, are those in place."""
         same = len(pairs) == len(self.given) and pairs.tobytes() == self.given.tobytes()
         for name, value in distances.items():
-            now = None if value is None else self._distances[name].value
+            now: Any = None if value is None else self._distances[name].value
             same = same and (value is now or np.array_equal(value, now))
         return same
 
@@ -271,7 +279,7 @@ class Operator(DeviceMemory):
         if not self.device.is_capturing and not all(
             asked.is_in_place() for stage in self.stages for asked in stage.state_arrays()
         ):
-            self.make_room(self.rooms)
+            self.make_room()
         for stage in self.stages:
             stage.search()
 
@@ -361,7 +369,7 @@ class Operator(DeviceMemory):
                 self.launch_search(between)
             found = read() if first is None else first()
             if found.totals.pairs > len(self.pairs):
-                self.make_room(self.rooms._replace(pairs=self.growth * found.totals.pairs))
+                self.make_room(pairs=self.growth * found.totals.pairs)
                 self.launch_search()
                 found = read()
             found = self._grow_uncertain(read, found)
@@ -381,7 +389,7 @@ class Operator(DeviceMemory):
     def _grow_uncertain(self, read, found: Found) -> Found:
         # How many wait varies for `any`, where the first hit of a pair ends its traversal.
         while 0 < len(self.hits.uncertain) < min(LIST_MAX, found.totals.uncertain):
-            self.make_room(self.rooms._replace(uncertain=min(2 * found.totals.uncertain, LIST_MAX)))
+            self.make_room(uncertain=min(2 * found.totals.uncertain, LIST_MAX))
             self.search()
             found = read()
         return found

@@ -2,7 +2,7 @@
 
 from contextlib import nullcontext
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -13,9 +13,6 @@ from warp_abtree.kernels.io import results as kernels
 from warp_abtree.query.result import COUNTERS, Found, Result, Totals
 from warp_abtree.query.sorting import HitSort, first_sort, sort_rows
 from warp_abtree.query.staging import Staging, first_rows, view_memory
-
-if TYPE_CHECKING:
-    from warp_abtree.query.operator import Operator
 
 # Rows that are expected come in steps.
 ROWS_STEP = 1024
@@ -33,7 +30,7 @@ def readout_kernels(device, output: str) -> list:
 class HostViews:
     """NumPy's views of an operator's arrays, where these are the host's memory."""
 
-    def __init__(self, operator: "Operator"):
+    def __init__(self, operator: Any):
         self.pairs = operator.pairs.numpy().reshape(-1, 2)
         self.pair_count = operator.pair_count.numpy()
         self.any_hit = operator.hits.any_hit.numpy()
@@ -53,7 +50,7 @@ class Readout:
         lists_hits: Whether a result has the hits as rows, which are sorted while the host still launches.
     """
 
-    def __init__(self, operator: "Operator"):
+    def __init__(self, operator: Any):
         self.operator, self.device = operator, operator.device
         self.packs = operator.regime.packs(self.device)
         self.lists_hits = operator.output == "faces"
@@ -101,7 +98,7 @@ class Readout:
         with whole:
             return self.make_result(self.read_pairs(device), device, with_rows)
 
-    def make_result(self, found: Found, device: bool, with_rows: bool = True) -> Result:
+    def make_result(self, found: Any, device: bool, with_rows: bool = True) -> Result:
         """Check that there was a launch, and read what the stages have found.
 
         Raises:
@@ -244,7 +241,7 @@ class Readout:
         operator.launch_kernel(kernels.pack_pair_kernel, threads, inputs, kernels.BLOCK_DIM, (n, words.ptr))
         return words
 
-    def read_hits(self, found: Found, device: bool):
+    def read_hits(self, found: Any, device: bool):
         """Read the hits as rows. Waits for the device, unless they stay there."""
         if found.faces is not None:
             return

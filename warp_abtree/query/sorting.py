@@ -1,6 +1,6 @@
 """Hits in the order of `Result.faces`, sorted on the host or on the device."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -8,9 +8,6 @@ import warp as wp
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.io import sort_hits, sort_segments
 from warp_abtree.query.staging import first_rows
-
-if TYPE_CHECKING:
-    from warp_abtree.query.operator import Operator
 
 # Rows whose sorting takes longer than packing each into one number, which sorts 20 times as fast.
 ROWS_TO_PACK = 1000
@@ -101,7 +98,7 @@ class HitSort:
         operator: Whose hits are sorted; those that are missing count as a pair of their own, the last.
     """
 
-    def __init__(self, operator: "Operator"):
+    def __init__(self, operator: Any):
         self.operator = operator
         self._none = tuple(wp.empty(0, dtype=dtype, device=operator.device) for dtype in (wp.int32, wp.int32, wp.vec3i))
 
@@ -120,7 +117,7 @@ class HitSort:
         operator = self.operator
         chosen, room = operator.regime.segments, len(operator.pairs)
         threads = segment_threads(count, room, chosen) if operator.device.is_cuda or chosen else 0
-        given = count, threads, order.ptr, key.ptr, rows.ptr
+        given: tuple = count, threads, order.ptr, key.ptr, rows.ptr
         if threads:
             if ends is None:
                 start = first_rows(staging.room("start", room + 1, wp.int32), room + 1)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from warp_abtree.query.request import check_within
-
-if TYPE_CHECKING:
-    from warp_abtree.query.operator import Operator
-    from warp_abtree.query.result import Found
 
 
 class Rooms(NamedTuple):
@@ -61,10 +57,10 @@ class Stage:
         distance: `PairDistance` that it is given, or None.
     """
 
-    operator: Operator
-    distance: PairDistance | None = None
+    operator: Any
+    distance: Any = None
 
-    def attach(self, operator: Operator):
+    def attach(self, operator: Any):
         """Take the operator, whose batch and guard are in place, and make what has no room of its own."""
         self.operator = operator
 
@@ -96,7 +92,7 @@ class Stage:
     def report(self, count: int | None):
         """Compute further outputs of so many hits; None: of as many as have room. Launches only."""
 
-    def read(self, found: Found, device: bool, with_rows: bool):
+    def read(self, found: Any, device: bool, with_rows: bool):
         """Add its part to what was found, on the host or in arrays of the device, perhaps without rows of hits."""
 
 

@@ -1,7 +1,7 @@
 """Queries that `Scene.intersect` makes, one of each kind, and keeps for the next time."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -35,29 +35,9 @@ def yes_or_no_kernels(device, face_counts) -> list:
     return [*operator_kernels(device, Query.plan("any"), "any"), *scene_kernels(device, face_counts, True)]
 
 
-class Kind(NamedTuple):
-    """Kind of an operator: how one is made, and of which stages, of what is asked of it."""
-
-    make: Callable[..., Operator]  # of scene, output and pairs, precision, and other options by name
-    plan: Callable[..., list]  # of output, precision, and whether there are distances by name
-
-
-def _make_query(scene, output, pairs, **options):
-    return Query(scene, output, pairs, **options)
-
-
-HITS = Kind(_make_query, lambda output, precision, given: Query.plan(output, precision, given.get("within")))
-KINDS = {
-    **dict.fromkeys(("any", "count", "faces"), HITS),
-    "contacts": Kind(
-        lambda scene, output, pairs, **options: ContactQuery(scene, pairs, **options),
-        lambda output, precision, given: ContactQuery.plan(precision, given.get("within"), gap=given.get("gap")),
-    ),
-    "distance": Kind(
-        lambda scene, output, pairs, precision, **options: DistanceQuery(scene, pairs, **options),
-        lambda output, precision, given: DistanceQuery.plan(),
-    ),
-}
+# Operators by output, and what they are told of a question beside its distances; `Query` answers all others.
+OPERATORS: dict[str, tuple[Any, tuple]] = {"contacts": (ContactQuery, ("precision",)), "distance": (DistanceQuery, ())}
+OF_HITS = Query, ("output", "precision")
 
 
 class KeptQueries:
@@ -94,7 +74,9 @@ class KeptQueries:
             originals = self._find_originals()
             asked, found = originals.batch, originals.broad_phase.find(reach) if pairs is None else pairs
         elif (*key, signed) not in self.kept:
-            self._load(KINDS[output].plan(output, precision, given), output, pairs is None)
+            kind, told = self._kind_of(output, precision)
+            stages = kind.plan(**told, **{name: given[name] for name in ("within", "gap") if name in given})
+            self._load(stages, output, pairs is None)
         found = self._find_pairs(found, reach)
         checked = {name: check_within(value, len(found), name) for name, value in distances.items()}
         if output == "distance":
@@ -110,7 +92,8 @@ class KeptQueries:
         """Ask the operator of a key, or one that is made; all is checked."""
         (output, precision, *_), query = key, self.kept.pop(key, None)
         if query is None:
-            query = KINDS[output].make(asked, output, pairs, precision=precision, **distances, **settings)
+            kind, told = self._kind_of(output, precision)
+            query = kind(asked, pairs=pairs, **told, **distances, **settings)
         else:
             if isinstance(query, DistanceQuery):
                 query.set_tolerance(**{name: value for name, value in settings.items() if name != "signed"})
@@ -119,6 +102,12 @@ class KeptQueries:
         if isinstance(query, ContactQuery):
             query.contact_dtype = contact_dtype
         return self._run(key, query, device)
+
+    @staticmethod
+    def _kind_of(output: str, precision: str) -> tuple:
+        """Return the operator that answers an output, and its keyword arguments that tell output and precision."""
+        kind, names = OPERATORS.get(output, OF_HITS)
+        return kind, {name: value for name, value in (("output", output), ("precision", precision)) if name in names}
 
     def _find_originals(self) -> Originals:
         if self._originals is None:

@@ -15,12 +15,13 @@ from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.base.arrays import NONE_REFUSED
 from warp_abtree.kernels.io.sweep import pose_placer, report_chunk_kernel
+from warp_abtree.query.operator import Operator
 from warp_abtree.query.request import SWEEP_OPTIONS, check_options, check_within, refuse_signed
 from warp_abtree.query.stages.distance import DistanceQuery, check_beyond, check_distance_options
 from warp_abtree.query.stages.first_contact import FirstContactQuery
 from warp_abtree.query.stages.intersect import Query
 from warp_abtree.scene.scene import Scene
-from warp_abtree.scene.sweep_poses import DeviceRows, refuse_row, take_ends, take_rows
+from warp_abtree.scene.sweep_poses import DeviceRows, PoseSlot, find_copy_stream, refuse_row, take_ends, take_rows
 from warp_abtree.state.arrays import ObjectArrays
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
@@ -84,32 +85,6 @@ class _Chunk:
             self.chunk_query = None
 
 
-@functools.cache
-def _find_copy_stream(alias):
-    """Return a device's stream for transfers, one for all: Warp makes and ends streams on one thread at a time."""
-    return wp.Stream(alias)
-
-
-class _Slot:
-    """Buffers through which a chunk passes: poses in, answers out. On the CPU host and device share them."""
-
-    def __init__(self, device, room, output, scalar, width):
-        def mirror(array):
-            return array if device.is_cpu else wp.empty(len(array), dtype=array.dtype, device="cpu", pinned=True)
-
-        self.width = width
-        self.poses = wp.empty((room, width), dtype=scalar, device=device)
-        self.answer = wp.empty(room if output == "any" else 0, dtype=wp.uint8, device=device)
-        self.report = wp.empty(2, dtype=wp.int32, device=device)
-        self.poses_flat = self.poses.flatten()
-        self.poses_host, self.report_host = mirror(self.poses_flat), mirror(self.report)
-        answer = wp.empty(room, dtype=wp.int64, device=device) if output == "count" else self.answer
-        self.answer_host = mirror(answer)
-        self.uncertain_room = 0
-        if device.is_cuda:
-            self.loaded, self.done = wp.Event(device), wp.Event(device)
-
-
 class _ChunkQuery:
     """One kind of query about a pair of models, and its buffer slots."""
 
@@ -120,7 +95,7 @@ class _ChunkQuery:
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
         if self.output == "distance":
-            self.query: Query = DistanceQuery(chunk.batch, self.pairs, signed=signed)
+            self.query: Operator = DistanceQuery(chunk.batch, self.pairs, signed=signed)
         elif self.output == "first_contact":
             self.query = FirstContactQuery(chunk.batch, None, self.pairs, linear=precision == "linear")
         else:
@@ -128,14 +103,14 @@ class _ChunkQuery:
             self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision, within=within)
         self.count = self.room
         self._slots: dict = {}
-        self.copies = _find_copy_stream(self.device.alias) if self.device.is_cuda else None
+        self.copies = find_copy_stream(self.device.alias) if self.device.is_cuda else None
 
     def _find_slots(self, poses):
         """Return the slots of poses of one type, made at the first use."""
         kind = poses.scalar, poses.width
         if kind not in self._slots:
             count = 1 + (self.output in PACKED_DTYPES)
-            made = [_Slot(self.device, self.room, self.output, *kind) for _ in range(count)]
+            made = [PoseSlot(self.device, self.room, self.output, *kind) for _ in range(count)]
             if self.device.is_cuda:
                 # Another stream may touch what was allocated on this one only once it is there.
                 wp.synchronize_device(self.device)

@@ -63,9 +63,7 @@ def mass_properties(model: Model) -> MassProperties:
     """
     import trimesh
 
-    model.warn_of_winding(
-        "the mass of its bodies and the normals of their contacts depend on the winding", stacklevel=5
-    )
+    model.warn_of_winding("the mass of its bodies and the normals of their contacts depend on the winding")
     vertices, faces, _ = model.mesh_at(model.lod_max)
     middle = 0.5 * (vertices.min(0) + vertices.max(0))
     size = np.ptp(vertices, axis=0).max()

@@ -1,4 +1,4 @@
-"""Gaps of rigid bodies, within which their contacts are looked for: as far as they move in a step: `AheadGaps`."""
+"""Gaps of rigid bodies, within which their contacts are looked for: as far as they move in a step."""
 
 import numpy as np
 import warp as wp
@@ -6,11 +6,11 @@ import warp as wp
 from warp_abtree.kernels.bodies import ahead
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.stage import Array, Rooms, fields
-from warp_abtree.query.stages.distance import NOT_BEYOND, Distance
-from warp_abtree.query.stages.intersect import Gaps, Intersect
+from warp_abtree.query.stages.distance import NOT_BEYOND, DistanceStage
+from warp_abtree.query.stages.intersect import GapStage, IntersectStage
 
 
-class AheadGaps(Gaps):
+class AheadGapStage(GapStage):
     """Gaps as wide as bodies move in a step, cut to a little over the distance of a pair where that is less.
 
     Args:
@@ -22,14 +22,14 @@ class AheadGaps(Gaps):
         super().__init__(bodies.reach)
         self._bodies, self._chosen = bodies, ahead.Chosen()
         # Of surfaces alone, of those pairs whose gap is wide.
-        self._distance = Distance(NOT_BEYOND, with_points=False)
-        self._nearest = Operator(scene, [Intersect(), self._distance], np.zeros((0, 2), np.int32))
+        self._distance = DistanceStage(NOT_BEYOND, with_points=False)
+        self._nearest = Operator(scene, [IntersectStage(), self._distance], np.zeros((0, 2), np.int32))
 
     def prepare(self, rooms: Rooms):
         """Make room for the distances of as many pairs."""
         nearest, chosen = self._nearest, self._chosen
         if rooms.pairs > nearest.rooms.pairs:
-            nearest.make_room(nearest.rooms._replace(pairs=rooms.pairs))
+            nearest.make_room(pairs=rooms.pairs)
         chosen.count, chosen.pairs = nearest.pair_count, nearest.pairs
         chosen.beyond = self._distance.found.beyond
 

@@ -7,8 +7,8 @@ from warp_abtree.kernels.bodies import continuous as kernels
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.request import Buffers
 from warp_abtree.query.stage import Array, Rooms
-from warp_abtree.query.stages.first_contact import FirstContact
-from warp_abtree.query.stages.intersect import Inside, Intersect
+from warp_abtree.query.stages.first_contact import FirstContactStage
+from warp_abtree.query.stages.intersect import InsideStage, IntersectStage
 from warp_abtree.scene.scene import Scene
 
 TIME_TOLERANCE = 2.0**-24  # of times, as a fraction of a step's motion
@@ -18,7 +18,7 @@ ROUND_MODES = kernels.CUT, kernels.MATCH, kernels.HOLD_BOTH, kernels.CERTIFY
 ROUNDS = [int(mode) for mode, times in zip(ROUND_MODES, (5, 4, 3, 1)) for _ in range(times)]
 
 
-class MotionRounds(FirstContact):
+class MotionRounds(FirstContactStage):
     """Cut the motions of objects in rounds, from goals on, until no pair that was apart meets.
 
     Args:
@@ -101,7 +101,7 @@ class CertifiedMotions(Operator):
 
     def __init__(self, scene: Scene, bodies, capacity: Buffers):
         self._rounds, self._bodies = MotionRounds(bodies), bodies
-        super().__init__(scene, [Intersect(), Inside(), self._rounds], None, capacity, sort_pairs=True)
+        super().__init__(scene, [IntersectStage(), InsideStage(), self._rounds], None, capacity, sort_pairs=True)
         self._pool, self.goals = self.batch.objects.pool, self._rounds.goals
         self._state, shared = self._rounds.state, self.broad_phase.shared_group
         # What moves in every world holds all of them together.

@@ -1,6 +1,6 @@
 """Rigid bodies that respond to the contacts of their meshes: `Dynamics`.
 
-One step: contacts where the bodies stand, and where they first meet as far ahead as they move (`AheadGaps`); gravity;
+One step: contacts where the bodies stand, and where they first meet as far ahead as they move; gravity;
 contact impulses by projected Gauss-Seidel with warm starting and Coulomb friction; position correction by split
 impulses; semi-implicit Euler with a symplectic rotation; with `continuous`, motions cut where surfaces would meet. All
 in float64; docs/dynamics.md has each part, what is conserved and repeated, figures, and limits.
@@ -23,7 +23,7 @@ from warp_abtree.query.request import Buffers, check_capacity
 from warp_abtree.query.stages.points import POINTS_MAX, ManifoldQuery
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.body_state import RigidBodies
-from warp_abtree.simulate.contacts_ahead import AheadGaps
+from warp_abtree.simulate.contacts_ahead import AheadGapStage
 from warp_abtree.simulate.continuous import CertifiedMotions
 
 SHELL = 0.75 * float(body_kernels.LOOKAHEAD_LEAST)  # with continuous bodies rest half a slop apart or more, in reach
@@ -78,7 +78,7 @@ class Dynamics(RigidBodies):
             raise ValueError(f"friction {friction!r} is below 0")
         by_color = current_regime().relax_by_color
         self._by_color = not self.device.is_cpu if by_color is None else by_color
-        self.query = ManifoldQuery(scene, None, capacity, gap=AheadGaps(scene, self.bodies))
+        self.query = ManifoldQuery(scene, None, capacity, gap=AheadGapStage(scene, self.bodies))
         self.certified = None
         if flag(continuous, "continuous"):
             self.certified = CertifiedMotions(scene, self.bodies, Buffers(pairs=check_capacity(capacity).pairs))

@@ -50,7 +50,7 @@ class Batch(DeviceMemory):
         self.mean_faces = float(models.face_count[self.object_model].mean()) if len(self.object_model) else 1.0
         self.solids = SolidArrays(models, states, solid) if np.any(solid) else None
         self._retired = False
-        self._trees, self._trees_made = Trees(), ()
+        self._trees, self._trees_made = Trees(), (-1, 0, 0)
 
     @property
     def lods(self) -> np.ndarray:

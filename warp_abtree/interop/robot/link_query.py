@@ -71,9 +71,11 @@ class LinkQuery(DeviceMemory):
             setattr(self.chunk, name, wp.zeros(shape, dtype=dtype, device=device))
         self.configurations = wp.zeros(rows, dtype=wp.float64, device=device)
         self.demand = wp.zeros(2, dtype=wp.int32, device=device)
-        self.lower, self.upper = (wp.zeros(batch.object_count, dtype=wp.vec3, device=device) for _ in range(2))
-        around = request.around
-        self.bvh = wp.Bvh(self.lower[:around], self.upper[:around]) if around else None
+        self.boxes, around = link_pairs.LinkBoxes(), request.around
+        for name in ("lower", "upper"):
+            setattr(self.boxes, name, wp.zeros(batch.object_count, dtype=wp.vec3, device=device))
+        self.bvh = wp.Bvh(self.boxes.lower[:around], self.boxes.upper[:around]) if around else None
+        self.boxes.bvh = wp.uint64(0) if self.bvh is None else self.bvh.id
 
     def place(self):
         """Pose the parts of all configurations, and box all objects. Launches only."""
@@ -83,7 +85,7 @@ class LinkQuery(DeviceMemory):
         wp.launch(forward.forward_kernel, self.active, inputs, device=device)
         inputs = [around, parts, self.frames, self.batch.objects.pool]
         wp.launch(forward.place_part_kernel, (self.active, len(parts)), inputs, device=device)
-        inputs = [self.batch.trees, self.query.guard.record(), 0.0, None, self.lower, self.upper]
+        inputs = [self.batch.trees, self.query.guard.record(), 0.0, None, self.boxes.lower, self.boxes.upper]
         wp.launch(pose_box_kernel, around + self.active * len(parts), inputs, device=device)
         if self.bvh is not None:
             self.bvh.rebuild()
@@ -104,10 +106,10 @@ class LinkQuery(DeviceMemory):
                 self._note([self.request.around, len(self.request.parts.frame), query.pair_batch])
 
     def _find_pairs(self, stage):
-        request, query, bvh = self.request, self.query, wp.uint64(0) if self.bvh is None else self.bvh.id
+        request, query = self.request, self.query
         distances = None if self._distances is None else query.distances_of(self._distances)
-        inputs = [self.mode, wp.vec2i(*stage), request.around, bvh, request.chain, request.parts, self.frames]
-        inputs += [self.lower, self.upper, self.chunk, query.pair_count, query.pairs, distances]
+        inputs = [self.mode, wp.vec2i(*stage), request.around, request.chain, request.parts, self.frames]
+        inputs += [self.boxes, self.chunk, query.pair_batch, distances]
         wp.launch(link_pairs.find_link_pair_kernel, self.active, inputs, device=self.device)
 
     def _begin(self):
@@ -126,14 +128,14 @@ class LinkQuery(DeviceMemory):
 
     def make_room_for(self, pairs: int, uncertain: int) -> bool:
         """Make room for a demand, and return whether there was too little."""
-        rooms = wanted = self.query.rooms
+        rooms, wanted = self.query.rooms, {}
         if pairs > rooms.pairs:
-            wanted = wanted._replace(pairs=pairs + pairs // 4)
+            wanted["pairs"] = pairs + pairs // 4
         if 0 < rooms.uncertain < uncertain:
-            wanted = wanted._replace(uncertain=2 * uncertain)
-        if wanted != rooms:
-            self.query.make_room(wanted)
-        return wanted != rooms
+            wanted["uncertain"] = 2 * uncertain
+        if wanted:
+            self.query.make_room(**wanted)
+        return bool(wanted)
 
 
 class LinkHits(LinkQuery):

@@ -76,7 +76,7 @@ from warp_abtree.query.request import CapacityError, check_request
 from warp_abtree.query.result import VECTORS, Found, contact_dtypes
 from warp_abtree.query.sorting import HitSort, first_sort
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
-from warp_abtree.query.stages.intersect import Apart, Gaps, Inside, Intersect
+from warp_abtree.query.stages.intersect import ApartStage, GapStage, InsideStage, IntersectStage
 from warp_abtree.query.staging import first_rows
 from warp_abtree.state.batch import Batch
 
@@ -85,7 +85,7 @@ from warp_abtree.state.batch import Batch
 DEFERRED_WARPS, LISTED_WARPS = 8, 16
 
 
-class Contacts(Stage):
+class ContactStage(Stage):
     """Sort the hits, and find the contact of each and the summary of each pair.
 
     Args:
@@ -238,7 +238,7 @@ class Contacts(Stage):
     def _share_contacts(self, found: Found, count: int):
         """Copy from arrays that are the host's memory."""
         pairs = len(found.pairs)
-        face_type, pair_type = self._dtypes()
+        face_type, pair_type = contact_dtypes(self.dtype, self._with_gap)
         found.contacts, found.pair_contacts = np.zeros(count, face_type), np.zeros(pairs, pair_type)
         found.faces = self.faces.numpy()[:count].reshape(-1, 3).copy()
         found.pair_contacts["count"] = found.count
@@ -252,7 +252,11 @@ class Contacts(Stage):
     def _transfer_contacts(self, found: Found, count: int):
         """Pack rows on the device, and bring them over."""
         staging, pairs = self.operator.readout.staging, len(found.pairs)
-        real, (face_type, pair_type), with_gap = self._real(), self._dtypes(), self._with_gap
+        real, (face_type, pair_type), with_gap = (
+            self._real(),
+            contact_dtypes(self.dtype, self._with_gap),
+            self._with_gap,
+        )
         memory = staging.row_pool.take(12 * count + pairs * pair_type.itemsize + count * face_type.itemsize)
 
         def pack_pairs(first, some, target):
@@ -290,9 +294,6 @@ class Contacts(Stage):
     def _launch(self, kernel, dim, inputs):
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.operator.device)
 
-    def _dtypes(self):
-        return contact_dtypes(self.dtype, self._with_gap)
-
     def _real(self):
         return wp.float64 if np.dtype(self.dtype) == np.float64 else wp.float32
 
@@ -304,19 +305,19 @@ def plan_contacts(precision, within, gap, sums: bool, dtype: Any = np.float64) -
         ValueError: An unknown precision.
     """
     check_request("faces", precision)
-    intersect = Intersect("faces", precision, gap is not None, reads=False)
-    apart: list[Stage] = [] if within is None else [Apart(within)]
+    intersect = IntersectStage("faces", precision, gap is not None, reads=False)
+    apart: list[Stage] = [] if within is None else [ApartStage(within)]
     if gap is not None:
-        gaps = gap if isinstance(gap, Gaps) else Gaps(gap)
+        gaps = gap if isinstance(gap, GapStage) else GapStage(gap)
         gaps.give_to(intersect.hits, precision)
         apart.append(gaps)
-    return [*apart, intersect, Inside(), Contacts(precision, gap is not None, sums, dtype)]
+    return [*apart, intersect, InsideStage(), ContactStage(precision, gap is not None, sums, dtype)]
 
 
 def warn_of_winding(scene):
     """Warn of models of a scene whose winding is not what normals of contacts take it for."""
     for model in () if isinstance(scene, Batch) else scene.models:
-        model.warn_of_winding("the normals of its contacts depend on the winding", stacklevel=5)
+        model.warn_of_winding("the normals of its contacts depend on the winding")
 
 
 class ContactQuery(Operator):
@@ -346,6 +347,8 @@ class ContactQuery(Operator):
             missing in all of the above, on a GPU not the same in each launch.
     """
 
+    _contacts: Any
+
     def __init__(
         self,
         scene,
@@ -358,7 +361,7 @@ class ContactQuery(Operator):
         gap=None,
     ):
         stages = self.plan(precision, within, contact_dtype, gap)
-        self._contacts: Any = stages[-1]
+        *_, self._contacts = stages
         warn_of_winding(scene)
         super().__init__(scene, stages, pairs, capacity, "faces", sort_pairs)
         self.contacts, self.pair_contacts = self._contacts.contacts, self._contacts.pair_contacts

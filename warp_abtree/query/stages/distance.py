@@ -54,7 +54,7 @@ from warp_abtree.query.operator import Operator
 from warp_abtree.query.request import check_within, refuse_signed
 from warp_abtree.query.result import DISTANCES, Found
 from warp_abtree.query.stage import Array, PairDistance, Rooms, Stage, fields
-from warp_abtree.query.stages.intersect import Inside, Intersect
+from warp_abtree.query.stages.intersect import InsideStage, IntersectStage
 from warp_abtree.query.staging import first_rows
 
 # Pairs that make a further core worth its while, which costs some 50 us.
@@ -104,14 +104,14 @@ def check_distance_options(options: dict) -> tuple[dict, bool, bool]:
     return tolerances, signed, originals
 
 
-class Distance(Stage):
+class DistanceStage(Stage):
     """Find the distances of the pairs that do not intersect, and points of those that do.
 
     Args:
         beyond: Distances that end the search of a pair, as `check_beyond` returns them.
         tolerances: As `check_tolerances` returns them.
         signed: Whether pairs have depths.
-        inside: `Inside`, the stage before; None for surfaces alone.
+        inside: `InsideStage`, the stage before; None for surfaces alone.
         with_points: Whether pairs that intersect have points.
 
     Attributes:
@@ -121,7 +121,9 @@ class Distance(Stage):
 
     memory: wp.array  # of each thread of the CPU
 
-    def __init__(self, beyond, tolerances=(0.0, 0.0), signed=False, inside: Inside | None = None, with_points=True):
+    def __init__(
+        self, beyond, tolerances=(0.0, 0.0), signed=False, inside: InsideStage | None = None, with_points=True
+    ):
         self.asked_tolerances, self._signed, self._inside, self._with_points = tolerances, signed, inside, with_points
         self._tolerances = frame.Tolerances()
         self._tolerances.tolerance, self._tolerances.relative = tolerances
@@ -298,18 +300,20 @@ class DistanceQuery(Operator):
         RuntimeError: A graph is being captured.
     """
 
+    _distance: Any
+
     def __init__(self, scene, pairs=None, capacity=None, tolerance=0.0, relative=0.0, beyond=None, signed=False):
         count = None if pairs is None else len(to_numpy(pairs, "pairs"))
         stages = self.plan(check_tolerances(tolerance, relative), check_beyond(beyond, count), signed)
-        self._distance: Any = stages[-1]
+        *_, self._distance = stages
         self.distances, self._signed = self._distance.distances, signed
         super().__init__(scene, stages, pairs, capacity)
 
     @staticmethod
     def plan(tolerances=(0.0, 0.0), beyond: np.ndarray = NOT_BEYOND, signed=False) -> list[Stage]:
         """Return the stages of a query, of tolerances and distances that are checked."""
-        inside = Inside()
-        return [Intersect(), inside, Distance(beyond, tolerances, flag(signed, "signed"), inside)]
+        inside = InsideStage()
+        return [IntersectStage(), inside, DistanceStage(beyond, tolerances, flag(signed, "signed"), inside)]
 
     def set_pairs(self, pairs, beyond=None):
         """Query other pairs from now on, in the room there is if they fit; beyond None keeps the distances.

@@ -35,7 +35,7 @@ from warp_abtree.query.operator import Operator
 from warp_abtree.query.result import Found
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
 from warp_abtree.query.stages.distance import PAIRS_A_CORE
-from warp_abtree.query.stages.intersect import Inside, Intersect
+from warp_abtree.query.stages.intersect import InsideStage, IntersectStage
 from warp_abtree.query.staging import first_rows
 from warp_abtree.state.poses import HostPoses, check_poses, device_rows, place_rows
 
@@ -64,7 +64,7 @@ def check_path(screw, linear):
 class SweptBoxes:
     """Boxes of objects on their way, for a `BroadPhase`."""
 
-    def __init__(self, stage: "FirstContact"):
+    def __init__(self, stage: "FirstContactStage"):
         self._stage = stage
 
     def given(self) -> tuple:
@@ -78,7 +78,7 @@ class SweptBoxes:
         return launch(start.sweep_box_kernel, dim=len(lower), inputs=inputs, device=operator.device)
 
 
-class FirstContact(Stage):
+class FirstContactStage(Stage):
     """Find when the pairs first touch that do not intersect at first.
 
     Args:
@@ -217,9 +217,11 @@ class FirstContactQuery(Operator):
         RuntimeError: A graph is being captured.
     """
 
+    _motions: Any
+
     def __init__(self, scene, end_poses, pairs=None, capacity=None, tolerance=1e-6, screw=False, linear=False):
         stages = self.plan(tolerance, screw, linear)
-        self._motions: Any = stages[-1]
+        *_, self._motions = stages
         self.contacts, self.ends = self._motions.contacts, self._motions.ends
         super().__init__(scene, stages, pairs, capacity, sort_pairs=True)
         self._host_ends = HostPoses(self.ends, self.device)
@@ -234,7 +236,8 @@ class FirstContactQuery(Operator):
             ValueError: A tolerance out of range, or two paths at a time.
         """
         check_path(screw, linear)
-        return [Intersect(), Inside(), FirstContact(check_time_tolerance(tolerance), bool(screw), bool(linear))]
+        motions = FirstContactStage(check_time_tolerance(tolerance), bool(screw), bool(linear))
+        return [IntersectStage(), InsideStage(), motions]
 
     def set_pairs(self, pairs):
         """Query other pairs from now on, in the room there is if they fit.

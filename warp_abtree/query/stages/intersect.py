@@ -46,7 +46,7 @@ class HitStage(Stage):
             setattr(self.hits, name, self.counts[k])
 
 
-class Intersect(HitStage):
+class IntersectStage(HitStage):
     """Find the faces of each pair that intersect, and with a gap those that are nearer than it.
 
     Args:
@@ -105,7 +105,7 @@ class Intersect(HitStage):
             self.operator.readout.read_hits(found, device)
 
 
-class Apart(HitStage):
+class ApartStage(HitStage):
     """Find the pairs that are not proved farther apart than a distance.
 
     Attributes:
@@ -143,7 +143,7 @@ class Apart(HitStage):
         traversal.launch("within", self.within, self.hits, int(face_pairs.WITHIN), int(face_pairs.OUTPUT_ANY))
 
 
-class Gaps(Stage):
+class GapStage(Stage):
     """Distances within which faces of a pair count as near: given, or the sum of what each of its objects has.
 
     Args:
@@ -196,7 +196,7 @@ class Gaps(Stage):
             operator.launch_kernel(near_faces.add_reach_kernel, len(operator.pairs), inputs)
 
 
-class Inside(Stage):
+class InsideStage(Stage):
     """Find what is inside solids, of the pairs whose surfaces do not meet; nothing where there are no solids.
 
     Attributes:
@@ -270,13 +270,13 @@ class Query(Operator):
             ValueError: An unknown output or precision.
         """
         check_request(output, precision)
-        first = [] if within is None else [Apart(within)]
-        return [*first, Intersect(output, precision), Inside()]
+        first = [] if within is None else [ApartStage(within)]
+        return [*first, IntersectStage(output, precision), InsideStage()]
 
     def prove_apart(self):
         """Find alone the pairs that are not proved apart by `within`. Launches only."""
         for stage in self.stages:
-            if isinstance(stage, Apart) and len(self.pairs):
+            if isinstance(stage, ApartStage) and len(self.pairs):
                 stage.search()
 
     def set_pairs(self, pairs, within=None):

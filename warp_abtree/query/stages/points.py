@@ -56,18 +56,18 @@ from warp_abtree.kernels.inside import inside_points
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.result import Found, Result
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
-from warp_abtree.query.stages.contacts import Contacts, plan_contacts, warn_of_winding
+from warp_abtree.query.stages.contacts import ContactStage, plan_contacts, warn_of_winding
 from warp_abtree.query.staging import first_rows
 
 POINTS_MAX = int(manifold.POINTS)
 POINT_FIELDS = {"point": wp.vec3d, "normal": wp.vec3d, "depth": wp.float64}
 
 
-class Points(Stage):
+class PointStage(Stage):
     """Reduce the contacts of each pair to points.
 
     Args:
-        contacts: `Contacts`, the stage before, whose scratch serves on.
+        contacts: `ContactStage`, the stage before, whose scratch serves on.
         with_gap: Whether faces that are apart have contacts, too.
         point_max: As `ManifoldQuery.point_max`.
 
@@ -75,7 +75,7 @@ class Points(Stage):
         manifolds, curves: Device arrays of `kernels.contacts.manifold`: points of pairs, loops of contacts.
     """
 
-    def __init__(self, contacts: Contacts, with_gap: bool, point_max: int):
+    def __init__(self, contacts: ContactStage, with_gap: bool, point_max: int):
         self._contacts, self._with_gap, self.point_max = contacts, with_gap, point_max
         self.manifolds, self.curves, self._large = manifold.Manifolds(), manifold.Curves(), contact.Deferred()
 
@@ -191,11 +191,13 @@ class ManifoldQuery(Operator):
 
     growth = 2
 
+    _contacts: Any
+
     def __init__(self, scene, pairs=None, capacity=None, precision="exact", gap=None, points=POINTS_MAX):
         self.point_max = whole_number(points, "points", 1, 64)
         stages = plan_contacts(precision, None, gap, sums=False)
-        self._contacts: Any = stages[-1]
-        found = Points(self._contacts, gap is not None, self.point_max)
+        *_, self._contacts = stages
+        found = PointStage(self._contacts, gap is not None, self.point_max)
         self.contacts, self.manifolds, self.curves = self._contacts.contacts, found.manifolds, found.curves
         warn_of_winding(scene)
         super().__init__(scene, [*stages, found], pairs, capacity, "faces", sort_pairs=True)
