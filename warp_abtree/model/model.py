@@ -124,16 +124,8 @@ class Model:
 
     @classmethod
     def from_arrays(
-        cls,
-        vertices,
-        faces,
-        base_faces: int = 10,
-        progress=None,
-        name: str = "arrays",
-        cache: bool = True,
-        orient: bool = False,
-        certify: bool = False,
-    ):
+        cls, vertices, faces, base_faces=10, progress=None, name="arrays", cache=True, orient=False, certify=False
+    ) -> "Model":
         """Build a model from vertices (v, 3) and faces (n, 3); see `load`."""
         return cls.load(mesh_from_arrays(vertices, faces, name=name), base_faces, progress, cache, orient, certify)
 

@@ -34,21 +34,13 @@ def object_mask(chosen, count):
 
 @dataclass(frozen=True)
 class MassProperties:
-    """Mass properties of a model at density 1, in the model's frame.
+    """Mass properties of a model at density 1, in the model's frame."""
 
-    Attributes:
-        volume: Volume [units^3].
-        centre: Centre of mass [units], float64 (3,).
-        moments: Principal moments of inertia about the centre, ascending, float64 (3,).
-        axes: Principal axes, a rotation matrix with unit columns, float64 (3, 3).
-        bounding_radius: Largest distance of a vertex from the centre [units].
-    """
-
-    volume: float
-    centre: np.ndarray
-    moments: np.ndarray
-    axes: np.ndarray
-    bounding_radius: float
+    volume: float  # [units^3]
+    centre: np.ndarray  # of mass [units], float64 (3,)
+    moments: np.ndarray  # principal moments of inertia about the centre, ascending, float64 (3,)
+    axes: np.ndarray  # principal axes, a rotation matrix with unit columns, float64 (3, 3)
+    bounding_radius: float  # largest distance of a vertex from the centre [units]
 
 
 IMMOVABLE = MassProperties(np.inf, np.zeros(3), np.full(3, np.inf), np.eye(3), np.inf)

@@ -19,19 +19,13 @@ NO_PAIRS = np.zeros((0, 2), np.int32)
 
 @dataclass
 class LinkRequest:
-    """Request of a chunk's query: a robot's chain and parts, and the objects of the batch.
-
-    Attributes:
-        stages: (first, end) of the entries of `parts` that are asked one after the other.
-        around: Objects of the surroundings, which come first.
-        room: Configurations.
-    """
+    """Request of a chunk's query: a robot's chain and parts, and the objects of the batch."""
 
     chain: forward.Chain
     parts: link_pairs.Parts
-    stages: list[tuple[int, int]]
-    around: int
-    room: int
+    stages: list[tuple[int, int]]  # (first, end) of the entries of `parts` that are asked one after the other
+    around: int  # objects of the surroundings, which come first
+    room: int  # configurations
 
 
 class LinkQuery(Query):

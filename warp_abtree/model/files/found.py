@@ -44,19 +44,12 @@ class Remarks:
 
 @dataclass(frozen=True, eq=False)
 class FileSurface:
-    """Triangles over one list of vertices, in the order of their file.
+    """Triangles over one list of vertices, in the order of their file."""
 
-    Attributes:
-        vertices: Positions [file's units], float64 (v, 3).
-        faces: Corners (n_f, 3), integers.
-        names: Of the parts that the file makes of its faces, None for one without a name.
-        parts: Part of each face (n_f,); None where there is one part.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    names: tuple[str | None, ...] = (None,)
-    parts: np.ndarray | None = None
+    vertices: np.ndarray  # positions [file's units], float64 (v, 3)
+    faces: np.ndarray  # corners (n_f, 3), integers
+    names: tuple[str | None, ...] = (None,)  # of the parts that the file makes of its faces, None without a name
+    parts: np.ndarray | None = None  # part of each face (n_f,); None where there is one part
 
     def as_scene(self, name: str):
         """Return a trimesh.Scene with a node of each part that has faces, those without a name called by one."""
