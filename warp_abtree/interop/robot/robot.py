@@ -10,14 +10,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import (
-    check_device,
-    flag,
-    is_device_array,
-    to_numpy,
-    whole_number,
-    wrap_array,
-)
+from warp_abtree.checks.arguments import check_device, flag, is_device_array, to_numpy, whole_number, wrap_array
 from warp_abtree.interop.robot.check import RobotQuery, check_edges
 from warp_abtree.interop.robot.description import Description, RobotError
 from warp_abtree.interop.robot.mjcf import read_mjcf
