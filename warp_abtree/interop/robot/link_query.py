@@ -97,12 +97,6 @@ class LinkQuery(Query):
         """Reduce the answers of a stage's pairs to those of configurations. Launches only."""
         raise NotImplementedError
 
-    def run_stages(self):
-        """Launch, and again with more room until nothing is lost. Waits for the device."""
-        self.launch()
-        while self.make_room_for(*self.demand.numpy().tolist()):
-            self.launch()
-
     def make_room_for(self, pairs: int, uncertain: int) -> bool:
         """Make room for a demand, and return whether there was too little."""
         lists = len(self.hits.uncertain)
