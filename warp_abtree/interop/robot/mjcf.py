@@ -2,12 +2,11 @@
 
 import math
 import re
-import warnings
 from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line
+from warp_abtree.checks.arguments import first_line, warn_caller
 from warp_abtree.interop.robot.description import (
     Description,
     Part,
@@ -123,11 +122,9 @@ def _warn_of_closures(mujoco, model, path):
     for t in [] if _is_off(mujoco, model, "LIMIT", "CONSTRAINT") else np.flatnonzero(model.tendon_limited).tolist():
         found.append(f"the limits of tendon {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TENDON, t) or t!r}")
     if _is_off(mujoco, model, "CONTACT", "CONSTRAINT"):
-        message = f"{path}: it disables contacts; Robot.check tests its pairs all the same"
-        warnings.warn(message, RuntimeWarning, stacklevel=4)
+        warn_caller(f"{path}: it disables contacts; Robot.check tests its pairs all the same")
     if found:
-        message = f"{path}: not enforced: {', '.join(found)}; links stand where their joints alone put them"
-        warnings.warn(message, RuntimeWarning, stacklevel=4)
+        warn_caller(f"{path}: not enforced: {', '.join(found)}; links stand where their joints alone put them")
 
 
 def _pose(position, quaternion=(1.0, 0.0, 0.0, 0.0)) -> np.ndarray:

@@ -4,13 +4,20 @@ A configuration holds a value of each of `joint_names` [rad, or the file's unit 
 file: poses of links are in that of its root, and what surrounds the robot is placed in it.
 """
 
-import warnings
 from pathlib import Path
 
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import check_device, flag, is_device_array, to_numpy, whole_number, wrap_array
+from warp_abtree.checks.arguments import (
+    check_device,
+    flag,
+    is_device_array,
+    to_numpy,
+    warn_caller,
+    whole_number,
+    wrap_array,
+)
 from warp_abtree.interop.robot.check import RobotQuery, check_edges
 from warp_abtree.interop.robot.description import Description, RobotError
 from warp_abtree.interop.robot.mjcf import read_mjcf
@@ -128,11 +135,7 @@ class Robot:
         for k in map(self.link_names.index, names):
             fixed = [k] if k in self.model_link else np.flatnonzero(body == body[k]).tolist()
             if not np.isin(fixed, self.model_link).any():
-                warnings.warn(
-                    f"mounted: no mesh is fixed to the link {self.link_names[k]!r}: naming it changes nothing",
-                    RuntimeWarning,
-                    stacklevel=4,
-                )
+                warn_caller(f"mounted: no mesh is fixed to the link {self.link_names[k]!r}: naming it changes nothing")
             found |= dict.fromkeys(fixed)
         return list(found)
 

@@ -1,10 +1,10 @@
 """Surfaces that readers of mesh files return, their remarks, and the error that they raise."""
 
-import inspect
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
+
+from warp_abtree.checks.arguments import warn_caller
 
 NAMED = 4  # things that a warning lists by name
 
@@ -35,11 +35,8 @@ class Remarks:
 
     def warn(self, where):
         """Warn of them, if any, at the line that called the library."""
-        frame, level = inspect.currentframe(), 1
-        while frame is not None and frame.f_globals.get("__name__", "").startswith("warp_abtree."):
-            frame, level = frame.f_back, level + 1
         if str(self):
-            warnings.warn(f"{where}: {self}", stacklevel=level)
+            warn_caller(f"{where}: {self}", UserWarning)
 
 
 @dataclass(frozen=True, eq=False)
