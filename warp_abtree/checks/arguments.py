@@ -151,10 +151,13 @@ def flag(value, what: str) -> bool:
     return bool(value)
 
 
-def broadcast_rows(values, what: str, shape: tuple) -> np.ndarray:
-    """Return a float64 copy of numbers, broadcast to a shape: one row, or number, serves all; or raise ValueError."""
+def broadcast_rows(values, what: str, shape: tuple, is_finite=True) -> np.ndarray:
+    """Return finite numbers, or any if told, as float64 broadcast to a shape, a copy; raise ValueError for others."""
     values = np.asarray(values, np.float64)
     try:
-        return np.broadcast_to(values, shape).copy()
+        rows = np.broadcast_to(values, shape).copy()
     except ValueError:
         raise ValueError(f"{what}: shape {values.shape} does not stretch to {shape}") from None
+    if is_finite and not np.isfinite(rows).all():
+        raise ValueError(f"{what}: a number is not finite")
+    return rows

@@ -98,14 +98,6 @@ def _ranks(worlds):
     return ranks
 
 
-def _finite_rows(values, what, count):
-    """Return a vector for each of `count` objects, float64 (count, 3)."""
-    values = broadcast_rows(values, what, (count, 3))
-    if not np.isfinite(values).all():
-        raise ValueError(f"{what}: a number is not finite")
-    return values
-
-
 class RigidBodies(DeviceMemory):
     """State of the bodies of a scene; `Dynamics` documents the arguments.
 
@@ -122,8 +114,8 @@ class RigidBodies(DeviceMemory):
         self.gravity = finite_array(gravity, "gravity", (3,))
         self.kinematic = object_mask(kinematic, n)
         self.rigid = ~self.kinematic & (pool.is_static.numpy() == 0)
-        velocity = _finite_rows(velocity, "velocity", n)
-        angular_velocity = _finite_rows(angular_velocity, "angular_velocity", n)
+        velocity = broadcast_rows(velocity, "velocity", (n, 3))
+        angular_velocity = broadcast_rows(angular_velocity, "angular_velocity", (n, 3))
         models = sorted({scene.object_model[i] for i in np.flatnonzero(self.rigid)})
         found = {m: mass_properties(scene.models[m]) for m in models}
         own = [found[m] if r else IMMOVABLE for m, r in zip(scene.object_model, self.rigid)]
