@@ -134,59 +134,44 @@ class ScenePlayback(Playback):
         return self.loaded.motion.poses(self.time) if self._bodies is None else self._bodies.poses()
 
 
-class MeshPlayback(Playback):
+class StillPlayback(Playback):
+    """A scene that stands at its poses, by default those of now; LODs begin where they are, and are swept if told."""
+
+    def __init__(self, scene: Scene, title: str, poses=None, sweep=None):
+        self._held = PoseInput(scene).poses.numpy().copy() if poses is None else np.array(poses, np.float64)
+        self._started, self._sweep = scene.lods, sweep
+        super().__init__(scene, title, scene.worlds, 1 / 30, MeshView())
+
+    def _begin(self):
+        self.scene.set_lods(self._started)
+        frame = Frame(self.scene, None, self._sweep, time_step=self.time_step)
+        frame.warm_up()
+        return frame, None, self._sweep
+
+    def _poses_now(self):
+        return self._held
+
+
+class MeshPlayback(StillPlayback):
     """Meshes at poses (n, 7), whose LODs sweep from where they start to the base and back."""
 
     def __init__(self, models, poses, lods, device=None):
-        self._start = np.array(poses, np.float64)
         scene = Scene(device=device)
         for model, pose, lod in zip(models, poses, lods):
             scene.add(model, pose=pose, lod=lod)
-        self._first = scene.lods
         self._sweeps = []
         for model in scene.models:
             mine = np.array([i for i, other in enumerate(models) if other is model])
             start = _fraction_at(model, lods[mine[0]])
             self._sweeps.append(LodSweep([(model, mine)], start, min(start, _fraction_at(model, 0)), SWEEP_PERIOD))
-        names = " and ".join(dict.fromkeys(map(_title, models)))
-        super().__init__(scene, names, np.zeros(len(models), int), 1 / 30, MeshView())
+        names = (m.name if m.parts == 1 else f"{m.name} ({m.parts} parts joined)" for m in models)
+        super().__init__(scene, " and ".join(dict.fromkeys(names)), poses, self._lods_at)
 
-    def _begin(self):
-        self.scene.set_lods(self._first)
-        frame = Frame(self.scene, None, self._sweep, time_step=self.time_step)
-        frame.warm_up()
-        return frame, None, self._sweep
-
-    def _sweep(self, time):
-        lods = self._first.astype(np.int64)
+    def _lods_at(self, time):
+        lods = self._started.astype(np.int64)
         for sweep in self._sweeps:
             sweep.apply(sweep.fraction(time), lods)
         return lods
-
-    def _poses_now(self):
-        return self._start
-
-
-class StillPlayback(Playback):
-    """A scene that stands at its poses; LODs begin where they are."""
-
-    def __init__(self, scene: Scene, title: str):
-        self._poses_held = PoseInput(scene).poses.numpy().copy()
-        self._lods_held = scene.lods
-        super().__init__(scene, title, scene.worlds, 1 / 30, MeshView())
-
-    def _begin(self):
-        self.scene.set_lods(self._lods_held)
-        frame = Frame(self.scene, time_step=self.time_step)
-        frame.warm_up()
-        return frame, None, None
-
-    def _poses_now(self):
-        return self._poses_held
-
-
-def _title(model) -> str:
-    return model.name if model.parts == 1 else f"{model.name} ({model.parts} parts joined)"
 
 
 def _fraction_at(model, lod) -> float:

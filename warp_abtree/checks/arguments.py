@@ -1,7 +1,8 @@
 """Checks of what a caller hands in: one clear error that names what and where, before anything is changed."""
 
+import inspect
 import os
-import sys
+import warnings
 
 import numpy as np
 import warp as wp
@@ -108,6 +109,14 @@ def first_line(error) -> str:
     return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
+def warn_caller(message: str, category: type[Warning] = RuntimeWarning):
+    """Warn at the line that called the library."""
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and frame.f_globals.get("__name__", "").startswith("warp_abtree."):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)
+
+
 def whole_number(value, what: str, low: int, high: int) -> int:
     """Return a whole number from low to high as int; raise ValueError for another value."""
     number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
@@ -142,18 +151,13 @@ def flag(value, what: str) -> bool:
     return bool(value)
 
 
-def broadcast_rows(values, what: str, shape: tuple) -> np.ndarray:
-    """Return a float64 copy of numbers, broadcast to a shape: one row, or number, serves all; or raise ValueError."""
+def broadcast_rows(values, what: str, shape: tuple, is_finite=True) -> np.ndarray:
+    """Return finite numbers, or any if told, as float64 broadcast to a shape, a copy; raise ValueError for others."""
     values = np.asarray(values, np.float64)
     try:
-        return np.broadcast_to(values, shape).copy()
+        rows = np.broadcast_to(values, shape).copy()
     except ValueError:
         raise ValueError(f"{what}: shape {values.shape} does not stretch to {shape}") from None
-
-
-def outer_level() -> int:
-    """Return the stacklevel by which a function of the library warns who called the library."""
-    level, frame = 1, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == "warp_abtree":
-        level, frame = level + 1, frame.f_back
-    return level
+    if is_finite and not np.isfinite(rows).all():
+        raise ValueError(f"{what}: a number is not finite")
+    return rows

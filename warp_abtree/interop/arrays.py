@@ -17,9 +17,6 @@ class PoseInput(DeviceMemory):
     It is to `Query` and `ContactQuery` what `Pipeline.poses` is to a frame. `launch()` only launches, so that a CUDA
     graph can capture it.
 
-    Args:
-        scene: `Scene` with all its objects.
-
     Attributes:
         poses: x y z qx qy qz qw [world units, unit quaternion], device float64 (n, 7); initially those of the scene.
             `wp.to_torch(poses)` and the like return writable views.

@@ -149,26 +149,22 @@ def _make_shape(prim, time):
         return prim.GetAttribute(name).Get(time)
 
     kind = prim.GetTypeName()
-    if kind == "Cube":
-        mesh = creation.box(extents=[get("size")] * 3)
-    elif kind == "Sphere":
-        mesh = creation.icosphere(subdivisions=SUBDIVISIONS, radius=get("radius"))
-    elif kind == "Cylinder":
-        mesh = creation.cylinder(radius=get("radius"), height=get("height"), sections=SECTIONS)
-    elif kind == "Cone":
-        mesh = creation.cone(radius=get("radius"), height=get("height"), sections=SECTIONS)
-    elif kind == "Capsule":
-        mesh = creation.capsule(radius=get("radius"), height=get("height"), count=(SECTIONS, SECTIONS))
-    elif kind == "Plane":
+    if kind == "Plane":
         return _make_plane(get("width") / 2, get("length") / 2, get("axis"))
-    else:
+    makers = {
+        "Cube": lambda: creation.box(extents=[get("size")] * 3),
+        "Sphere": lambda: creation.icosphere(subdivisions=SUBDIVISIONS, radius=get("radius")),
+        "Cylinder": lambda: creation.cylinder(radius=get("radius"), height=get("height"), sections=SECTIONS),
+        "Cone": lambda: creation.cone(radius=get("radius"), height=get("height"), sections=SECTIONS),
+        "Capsule": lambda: creation.capsule(radius=get("radius"), height=get("height"), count=(SECTIONS, SECTIONS)),
+    }
+    if kind not in makers:
         return None
+    mesh = makers[kind]()
     vertices = np.asarray(mesh.vertices, np.float64)
     # Of USD all have their middle at the origin.
     vertices = vertices - (vertices.min(0) + vertices.max(0)) / 2
-    return vertices[:, AXIS_COLUMNS[get("axis")] if prim.HasAttribute("axis") else AXIS_COLUMNS["Z"]], np.asarray(
-        mesh.faces
-    )
+    return vertices[:, AXIS_COLUMNS[get("axis") if prim.HasAttribute("axis") else "Z"]], np.asarray(mesh.faces)
 
 
 def _make_plane(width, length, axis):

@@ -39,7 +39,7 @@ class ShardFolder:
     """
 
     def __init__(self, out, job):
-        self.path, self.unit = Path(out), job.unit
+        self.path = Path(out)
         known = json.loads(json.dumps({**job.describe(), "file": "npz"}))
         self.manifest = {"format": SHARD_FORMAT, "version": SHARD_VERSION, "hash": _hash_job(known), "job": known}
         self.left = dict.fromkeys(_ranges(known))

@@ -87,8 +87,6 @@ class SweepJob:
         ValueError: Bad poses or LODs (the message names the first), or an unknown option.
     """
 
-    unit = "pose"
-
     def __init__(self, model_a, model_b, poses, lods=None, output="any", precision="exact", shard=SHARD):
         for model in (model_a, model_b):
             if not isinstance(model, Model):

@@ -36,26 +36,16 @@ class ProgressiveMesh:
 
     Nodes 0..n_v-1 of the forest are the original vertices, node n_v+j is made by merge j; at `lod` the merges
     0..m-lod-1 are applied, and split i undoes merge m-1-i.
-
-    Attributes:
-        vertex_parent: Node that each node merges into, -1 at a root, shape [n_v+m].
-        vertex_pos: Positions [model units], shape [n_v+m, 3]; the first n_v are the original's, to the bit.
-        face_vertex: Original faces, shape [n_f, 3].
-        face_split: Face f is active iff lod >= face_split[f], m+1 for dropped faces; shape [n_f].
-        split_start: Where each split's slice of `split_face` begins, shape [m+1].
-        split_face: Slice i lists, ascending, every face that split i inserts or deforms.
-        known_error: `lod_error` where it was certified before, else None.
-        error_key: Key of the cache under which `lod_error` is kept once certified, None keeps none.
     """
 
-    vertex_parent: np.ndarray
-    vertex_pos: np.ndarray
-    face_vertex: np.ndarray
-    face_split: np.ndarray
-    split_start: np.ndarray
-    split_face: np.ndarray
-    known_error: np.ndarray | None = None
-    error_key: str | None = None
+    vertex_parent: np.ndarray  # node that each node merges into, -1 at a root, [n_v+m]
+    vertex_pos: np.ndarray  # positions [model units], [n_v+m, 3]; the first n_v are the original's, to the bit
+    face_vertex: np.ndarray  # original faces, [n_f, 3]
+    face_split: np.ndarray  # face f is active iff lod >= face_split[f], m+1 for dropped faces; [n_f]
+    split_start: np.ndarray  # where each split's slice of `split_face` begins, [m+1]
+    split_face: np.ndarray  # slice i lists, ascending, every face that split i inserts or deforms
+    known_error: np.ndarray | None = None  # `lod_error` where it was certified before
+    error_key: str | None = None  # of the cache under which `lod_error` is kept once certified; None keeps none
 
     @cached_property
     def lod_error(self) -> np.ndarray:

@@ -34,21 +34,13 @@ def object_mask(chosen, count):
 
 @dataclass(frozen=True)
 class MassProperties:
-    """Mass properties of a model at density 1, in the model's frame.
+    """Mass properties of a model at density 1, in the model's frame."""
 
-    Attributes:
-        volume: Volume [units^3].
-        centre: Centre of mass [units], float64 (3,).
-        moments: Principal moments of inertia about the centre, ascending, float64 (3,).
-        axes: Principal axes, a rotation matrix with unit columns, float64 (3, 3).
-        bounding_radius: Largest distance of a vertex from the centre [units].
-    """
-
-    volume: float
-    centre: np.ndarray
-    moments: np.ndarray
-    axes: np.ndarray
-    bounding_radius: float
+    volume: float  # [units^3]
+    centre: np.ndarray  # of mass [units], float64 (3,)
+    moments: np.ndarray  # principal moments of inertia about the centre, ascending, float64 (3,)
+    axes: np.ndarray  # principal axes, a rotation matrix with unit columns, float64 (3, 3)
+    bounding_radius: float  # largest distance of a vertex from the centre [units]
 
 
 IMMOVABLE = MassProperties(np.inf, np.zeros(3), np.full(3, np.inf), np.eye(3), np.inf)
@@ -104,14 +96,6 @@ def _ranks(worlds):
     return ranks
 
 
-def _finite_rows(values, what, count):
-    """Return a vector for each of `count` objects, float64 (count, 3)."""
-    values = broadcast_rows(values, what, (count, 3))
-    if not np.isfinite(values).all():
-        raise ValueError(f"{what}: a number is not finite")
-    return values
-
-
 class RigidBodies(DeviceMemory):
     """State of the bodies of a scene; `Dynamics` documents the arguments.
 
@@ -128,8 +112,8 @@ class RigidBodies(DeviceMemory):
         self.gravity = finite_array(gravity, "gravity", (3,))
         self.kinematic = object_mask(kinematic, n)
         self.rigid = ~self.kinematic & (pool.is_static.numpy() == 0)
-        velocity = _finite_rows(velocity, "velocity", n)
-        angular_velocity = _finite_rows(angular_velocity, "angular_velocity", n)
+        velocity = broadcast_rows(velocity, "velocity", (n, 3))
+        angular_velocity = broadcast_rows(angular_velocity, "angular_velocity", (n, 3))
         models = sorted({scene.object_model[i] for i in np.flatnonzero(self.rigid)})
         found = {m: mass_properties(scene.models[m]) for m in models}
         own = [found[m] if r else IMMOVABLE for m, r in zip(scene.object_model, self.rigid)]

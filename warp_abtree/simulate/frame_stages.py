@@ -48,7 +48,7 @@ class FrameStages:
         self.scene, self.batch, self.device = scene, scene.batch(), scene.device
         self.controller, self.dynamics, self.time_step = controller, dynamics, time_step
         self.query = self._make_query(output) if dynamics is None else dynamics.query
-        self._filter = self.batch.filter_generation.number
+        self._filter, self._output = self.batch.filter_generation.number, output
         self._levels: Any = None
         self.table: Any = None
         if controller is not None:
@@ -91,10 +91,6 @@ class FrameStages:
         if self.dynamics is not None:
             return True
         return self._filter == self.batch.filter_generation.number and self._output == output
-
-    @property
-    def _output(self):
-        return "contacts" if isinstance(self.query, ContactQuery) else self.query.output
 
     def warm_up(self):
         """Load the kernels that no other operator has loaded, and make room for what is found; nothing moves."""

@@ -84,7 +84,9 @@ def query(options, progress):
             result["distance"] = f"farther than {show_number(result.pop('bracket')[0])}"
             del result["points"], result["point_faces"]
     if found.contacts is not None:
-        result |= {"contacts": _flat_contacts(found.contacts), "pair_contacts": _named(found.pair_contacts[0])}
+        names = found.contacts.dtype.names[2:]
+        rows = [{"face_a": r["faces"][0], "face_b": r["faces"][1], **_named(r, names)} for r in found.contacts]
+        result |= {"contacts": rows, "pair_contacts": _named(found.pair_contacts[0])}
     if options.record:
         record_found(found, options.record)
         result["written"] = [str(options.record)]
@@ -118,12 +120,6 @@ def _make_scene(options, progress):
     except ValueError as error:
         raise ValueError(f"--{error}") from None
     return scene, models
-
-
-def _flat_contacts(contacts) -> list[dict]:
-    """Return the contacts of one object pair as a dictionary each, their faces under `face_a` and `face_b`."""
-    names = contacts.dtype.names[2:]
-    return [{"face_a": row["faces"][0], "face_b": row["faces"][1], **_named(row, names)} for row in contacts]
 
 
 def _named(row, names=None) -> dict:

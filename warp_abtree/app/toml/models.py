@@ -2,7 +2,6 @@
 
 import importlib.util
 import math
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import trimesh
 
 from warp_abtree.app.toml.errors import fail
 from warp_abtree.app.toml.shapes import FACE_BOUNDS, GENERATED
+from warp_abtree.checks.arguments import warn_caller
 from warp_abtree.model.mesh import Mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model
 
@@ -38,7 +38,7 @@ def build_model(path: Path, name: str, table, progress=None) -> Model:
     mesh = _load(path, name, table)
     if mesh.parts > 1:
         about = f"the {mesh.parts} parts of {table.mesh} are joined into one mesh"
-        warnings.warn(f"{path}: models.{name}: {about}; scene_from_file makes an object of each", stacklevel=2)
+        warn_caller(f"{path}: models.{name}: {about}; scene_from_file makes an object of each", UserWarning)
     try:
         lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         vertices = mesh.vertices - (lower / 2 + upper / 2) if table.centre else mesh.vertices

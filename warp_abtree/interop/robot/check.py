@@ -73,7 +73,7 @@ class RobotQuery(DeviceMemory):
 
     def __init__(self, robot, around, output: str, room: int):
         self.device, self.output, self.room = robot.device, output, room
-        self._robots = made = RobotBatch(around, robot.models, room, robot.device)
+        self.robots = made = RobotBatch(around, robot.models, room, robot.device)
         request = make_link_request(robot, made, room)
         self._around, self._models = made.count, len(robot.models)
         given = made.batch, request, max(1, PAIRS_GUESS * room)
@@ -84,13 +84,9 @@ class RobotQuery(DeviceMemory):
         self._chunk.count.fill_(room)
         self.take_poses()
 
-    def is_of(self, around) -> bool:
-        """Return whether what surrounds the robot has the objects and LODs of before."""
-        return self._robots.is_of(around)
-
     def take_poses(self):
         """Read where what surrounds the robot is now. Launches only."""
-        self._robots.take_poses()
+        self.robots.take_poses()
 
     def launch(self):
         """Check all configurations. Launches only."""
@@ -124,7 +120,10 @@ class RobotQuery(DeviceMemory):
                 continue
             for name in ("distance", "points", "faces", "pair"):
                 part[name] = getattr(self.nearest, name)[:count].numpy()
-            self._number(part["pair"])
+            # Objects as models of the robot, and what surrounds it after these.
+            pairs = part["pair"]
+            own = np.where(pairs < self._around, pairs + self._models, (pairs - self._around) % self._models)
+            part["pair"] = np.where(pairs < 0, -1, own)
         return answers
 
     def _run(self, rows, first, count):
@@ -132,12 +131,9 @@ class RobotQuery(DeviceMemory):
         self._chunk.count.fill_(count)
         width = self.configurations.shape[1]
         wp.copy(self.configurations, rows, src_offset=first * width, count=count * width)
-        self._links.run_stages()
-
-    def _number(self, pairs: np.ndarray):
-        """Number pairs of objects as models of the robot, and what surrounds it after these."""
-        part = (pairs - self._around) % self._models
-        pairs[:] = np.where(pairs < 0, -1, np.where(pairs < self._around, pairs + self._models, part))
+        self._links.launch()
+        while self._links.make_room_for(*self._links.demand.numpy().tolist()):
+            self._links.launch()
 
     def ask_spread(self, middles, halves, sizes) -> tuple[np.ndarray, np.ndarray]:
         """Return which configurations meet, and which are not proved apart for all that joint values may differ by.

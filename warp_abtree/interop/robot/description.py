@@ -20,23 +20,14 @@ class RobotError(ValueError):
 
 @dataclass
 class RobotFrame:
-    """A frame: its parent's, moved by a fixed transform, then by a joint.
+    """A frame: its parent's, moved by a fixed transform, then by a joint."""
 
-    Attributes:
-        parent: Index of an earlier frame, -1 for none.
-        origin: Fixed transform, float64 (4, 4), rigid [robot units].
-        kind: "fixed", "revolute" or "prismatic".
-        axis: Of the joint, unit, (3,).
-        joint: Name of the joint whose value moves it, None where it is fixed.
-        scale, offset: Value of this joint = scale * that of `joint` + offset.
-    """
-
-    parent: int
-    origin: np.ndarray
-    kind: str = "fixed"
-    axis: tuple = (0.0, 0.0, 1.0)
-    joint: str | None = None
-    scale: float = 1.0
+    parent: int  # index of an earlier frame, -1 for none
+    origin: np.ndarray  # fixed transform, float64 (4, 4), rigid [robot units]
+    kind: str = "fixed"  # or "revolute" or "prismatic"
+    axis: tuple = (0.0, 0.0, 1.0)  # of the joint, unit, (3,)
+    joint: str | None = None  # name of the joint whose value moves it, None where it is fixed
+    scale: float = 1.0  # value of this joint = scale * that of `joint` + offset
     offset: float = 0.0
 
 
@@ -52,26 +43,16 @@ class Part:
 
 @dataclass
 class Description:
-    """A robot as its file describes it.
+    """A robot as its file describes it."""
 
-    Attributes:
-        frames: Parents first.
-        joints: Limits (lower, upper) by the name of each joint that a configuration sets, in order [rad or robot
-            units].
-        links: Index of the frame of each link, by its name.
-        parts: Meshes of links; a link has none, one, or several whose bits differ.
-        excluded: Pairs of names of links that the file says are never tested.
-        demanded: Pairs of indices of parts that the file says are tested, whatever else would leave them out.
-        neighbours: Links that a joint joins and that are not tested: "all", "moving" for those that both move against
-            the root, "none".
-    """
-
-    frames: list[RobotFrame] = field(default_factory=list)
+    frames: list[RobotFrame] = field(default_factory=list)  # parents first
+    # Limits (lower, upper) by the name of each joint that a configuration sets, in order [rad or robot units].
     joints: dict[str, tuple[float, float]] = field(default_factory=dict)
-    links: dict[str, int] = field(default_factory=dict)
-    parts: list[Part] = field(default_factory=list)
-    excluded: set[frozenset] = field(default_factory=set)
-    demanded: set[frozenset] = field(default_factory=set)
+    links: dict[str, int] = field(default_factory=dict)  # index of the frame of each link, by its name
+    parts: list[Part] = field(default_factory=list)  # of links: a link has none, one, or several whose bits differ
+    excluded: set[frozenset] = field(default_factory=set)  # pairs of names of links that are never tested
+    demanded: set[frozenset] = field(default_factory=set)  # pairs of indices of parts that are tested, whatever else
+    # Links that a joint joins and that are not tested: "all", "moving" if both move against the root, "none".
     neighbours: str = "all"
 
     def bodies(self) -> np.ndarray:

@@ -20,19 +20,13 @@ NO_PAIRS = np.zeros((0, 2), np.int32)
 
 @dataclass
 class LinkRequest:
-    """Request of a chunk's query: a robot's chain and parts, and the objects of the batch.
-
-    Attributes:
-        stages: (first, end) of the entries of `parts` that are asked one after the other.
-        around: Objects of the surroundings, which come first.
-        room: Configurations.
-    """
+    """Request of a chunk's query: a robot's chain and parts, and the objects of the batch."""
 
     chain: forward.Chain
     parts: link_pairs.Parts
-    stages: list[tuple[int, int]]
-    around: int
-    room: int
+    stages: list[tuple[int, int]]  # (first, end) of the entries of `parts` that are asked one after the other
+    around: int  # objects of the surroundings, which come first
+    room: int  # configurations
 
 
 class LinkQuery(DeviceMemory):
@@ -119,12 +113,6 @@ class LinkQuery(DeviceMemory):
     def _note(self, found: list):
         """Reduce the answers of a stage's pairs to those of configurations. Launches only."""
         raise NotImplementedError
-
-    def run_stages(self):
-        """Launch, and again with more room until nothing is lost. Waits for the device."""
-        self.launch()
-        while self.make_room_for(*self.demand.numpy().tolist()):
-            self.launch()
 
     def make_room_for(self, pairs: int, uncertain: int) -> bool:
         """Make room for a demand, and return whether there was too little."""

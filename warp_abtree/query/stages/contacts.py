@@ -299,11 +299,7 @@ class ContactStage(Stage):
 
 
 def plan_contacts(precision, within, gap, sums: bool, dtype: Any = np.float64) -> list[Stage]:
-    """Return the stages that find contacts, and their summaries or not.
-
-    Raises:
-        ValueError: An unknown precision.
-    """
+    """Return the stages that find contacts, and their summaries or not; raise ValueError for an unknown precision."""
     check_request("faces", precision)
     intersect = IntersectStage("faces", precision, gap is not None, reads=False)
     apart: list[Stage] = [] if within is None else [ApartStage(within)]
@@ -368,11 +364,7 @@ class ContactQuery(Operator):
 
     @staticmethod
     def plan(precision="exact", within=None, contact_dtype=np.float64, gap=None) -> list[Stage]:
-        """Return the stages of a query.
-
-        Raises:
-            ValueError: An unknown precision, or a type that is neither float32 nor float64.
-        """
+        """Return the stages of a query; raise ValueError for a precision or type that there is none of."""
         contact_dtypes(contact_dtype)
         return plan_contacts(precision, within, gap, True, contact_dtype)
 
