@@ -38,8 +38,9 @@ PANEL = (4.6, 3.9)  # inches
 
 
 def read_layout(name) -> dict:
-    """Return the tables and figures of a TOML file of this folder."""
-    return tomllib.loads((HERE / name).read_text(encoding="utf-8"))
+    """Return the tables and figures of a TOML file of this folder; a table's name is that of its part by default."""
+    layout = tomllib.loads((HERE / name).read_text(encoding="utf-8"))
+    return layout | {"table": [{"name": table.get("part")} | table for table in layout.get("table", [])]}
 
 
 def pick(rows, **where) -> list:
@@ -88,17 +89,18 @@ def select_rows(layout, study):
     A layout's `rows` are texts, each with the values of one row of the study in it.
     """
     if "rows" in layout:
-        return [show_row(row, study) for row in layout["rows"]]
+        names = [name for name, *_ in layout["columns"]]
+        return [dict(zip(names, show_row(row, study), strict=True)) for row in layout["rows"]]
     rows = pick(study["parts"].get(layout["part"], {"rows": []})["rows"], **layout.get("where", {}))
     if rows and "select" in layout:
         rows = importlib.import_module(f"bench.studies.{study['study']}").SUMMARIES[layout["select"]](rows)
     return rows
 
 
-def show_row(layout, study) -> dict:
+def show_row(layout, study) -> list:
     """Return the texts of a row, its values filled in."""
     (row,) = pick(study["parts"][layout["part"]]["rows"], **layout["where"])
-    return {name: text.format(**row) for name, text in layout["show"].items()}
+    return [text.format(**row) for text in layout["show"]]
 
 
 def markdown_table(layout, study, short=None) -> str:
@@ -187,10 +189,10 @@ def draw(figures, rows, folder) -> str:
     """Draw figures of rows as SVG; return the line that says what was drawn, or why nothing was.
 
     Args:
-        figures: As in a layout: file, and panels side by side, each with title, x and y (columns, y with what they are
-            called), xlabel, ylabel; also where (column to value), by (column whose values are lines of their own),
-            unit (the word after these values), split (column whose values are panels of their own), slope (whether
-            labels show it), xscale and yscale ("log").
+        figures: As in a layout: file, and panels side by side (none is one), each with title, x and y (columns, y with
+            what they are called), xlabel, ylabel; also where (column to value), by (column whose values are lines of
+            their own), unit (the word after these values), split (column whose values are panels of their own), slope
+            (whether labels show it), xscale and yscale ("log"). A panel takes what it does not say from its figure.
         rows: A list; or a function that returns those of a figure.
     """
     try:
@@ -204,7 +206,8 @@ def draw(figures, rows, folder) -> str:
     with matplotlib.rc_context(STYLE):
         for figure in figures:
             found = rows(figure) if callable(rows) else rows
-            panels = [pair for panel in figure["panels"] for pair in split_panel(panel, found)]
+            whole = {key: value for key, value in figure.items() if key not in ("where", "panels")}
+            panels = [pair for panel in figure.get("panels", [{}]) for pair in split_panel(whole | panel, found)]
             panels = [(panel, lines) for panel, own in panels if (lines := find_lines(own, panel))]
             if not panels:
                 continue

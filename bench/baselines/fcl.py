@@ -9,6 +9,17 @@ import numpy as np
 ALL_CONTACTS = 2**31 - 1
 
 
+def make_tree(vertices, faces):
+    """Return a BVHModel of a mesh."""
+    import fcl
+
+    tree = fcl.BVHModel()
+    tree.beginModel(len(vertices), len(faces))
+    tree.addSubModel(vertices, faces)
+    tree.endModel()
+    return tree
+
+
 class Fcl:
     """python-fcl.
 
@@ -35,11 +46,7 @@ class Fcl:
         if self.convex:
             corners = np.concatenate([np.full((len(faces), 1), 3), faces], 1).flatten()
             return self.fcl.Convex(vertices, len(faces), corners)
-        tree = self.fcl.BVHModel()
-        tree.beginModel(len(vertices), len(faces))
-        tree.addSubModel(vertices, faces)
-        tree.endModel()
-        return tree
+        return make_tree(vertices, faces)
 
     def place(self, matrices):
         """Make an object of B for each pose."""
@@ -91,6 +98,37 @@ class Fcl:
     def face_pairs(answer):
         """Return the face numbers in one answer, (k, 2)."""
         return [(contact.b1, contact.b2) for contact in answer.contacts]
+
+
+class FclRobot:
+    """python-fcl, asked what a robot is asked: a BVHModel a link, pair by pair until two intersect.
+
+    Args:
+        robot: `ab.Robot`.
+        around: `ab.Model` of what surrounds it.
+    """
+
+    def __init__(self, robot, around):
+        import fcl
+
+        self.fcl, self.robot = fcl, robot
+        self.around, *self.parts = (
+            fcl.CollisionObject(make_tree(*model.mesh_at(model.lod_max)[:2]), fcl.Transform())
+            for model in (around, *robot.models)
+        )
+        moving = [k for k, link in enumerate(robot.model_link) if link not in robot.mounted]
+        self.pairs = [(self.parts[k], self.around) for k in reversed(moving)]
+        self.pairs += [(self.parts[i], self.parts[j]) for i, j in robot.pairs.tolist()]
+
+    def any(self, poses):
+        """Return whether parts meet at each of some link poses (c, links, 4, 4)."""
+        return np.array([self._meets(row[self.robot.model_link]) for row in poses])
+
+    def _meets(self, matrices):
+        for part, matrix in zip(self.parts, matrices):
+            part.setTransform(self.fcl.Transform(matrix[:3, :3], matrix[:3, 3]))
+        request = self.fcl.CollisionRequest()
+        return any(self.fcl.collide(a, b, request, self.fcl.CollisionResult()) for a, b in self.pairs)
 
 
 class Trimesh:

@@ -148,4 +148,4 @@ def layout(name) -> dict:
     """Return the figure of a case, see `tables.draw`."""
     panel = {"x": "line", "xscale": "linear", "by": "series", "legend": False, "y": {"relative": ""}}
     panel |= {"xlabel": "run of the command", "ylabel": "time over that of the first run", "title": name}
-    return {"file": f"{name}.svg", "panels": [panel]}
+    return panel | {"file": f"{name}.svg"}

@@ -151,11 +151,8 @@ def check_budget(rows):
 
 
 def check_robot(rows):
-    assert [row["output"] for row in rows] == ["any", "distance", "distance", "edges", "spheres", "spheres"]
+    assert [row["output"] for row in rows] == ["any", "distance", "distance", "edges"]
     assert rows[0]["differ_from_fcl"] == 0 and 0 < rows[0]["meet"] < 1 and rows[3]["clear"] > 0
-    cover, less = rows[4:]
-    assert cover["spheres"] == 30 and cover["world_missed"] == cover["all_missed"] == 0 < cover["all_false"]
-    assert less["all_false"] < cover["all_false"]
 
 
 def check_gate(rows):

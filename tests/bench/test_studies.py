@@ -54,7 +54,7 @@ def check_paper(parts, model):
     assert all(few <= many for few, many in zip(*hits, strict=True))
     assert all(row["ours_nodes"] == row["static_nodes"] for row in pick(parts["static"], share=1.0))
     steps = pick(parts["figure4"], case="figure 4")
-    same = [abs(row["moved"]) == row["paper"] for row in steps]
+    same = [row["moved"] == row["paper"] for row in steps]
     # In frame 10, still over the budget, the figure stands still where ours goes on by one step: an erratum.
     assert len(steps) == 30 and sum(same) == 27 and all(same[:27])
 
@@ -96,9 +96,6 @@ def check_distances(rows):
     found = *ours, *theirs, *ended
     assert all(row["us"] > 0 and row["distance_mean"] is not None for row in found)
     assert all(0 < row["proved"] for row in ended)
-    refined = pick(rows, case="refine")
-    assert len(refined) == len(distances.REFINED) * len(distances.ASKED)
-    assert all(0 <= row["decided"] <= 1 and row["refine_cost"] > 0 for row in refined)
 
 
 def check_motions(rows):

@@ -24,13 +24,13 @@ AFTER = 1.0  # seconds of a scene before frames are judged
 
 
 def run(context):
-    """Yield one row a kind of object and frame of figure 4, and one a controller and frame of a budget held."""
+    """Yield one row a kind of object and frame of figure 4, and one a controller that holds a budget."""
     yield from step_figure_4(context)
-    yield from trace_budget(context)
+    yield from hold_budget(context)
 
 
 def step_figure_4(context):
-    """Yield how far the paper's controller moves objects of all three kinds along the figure's course of times."""
+    """Yield the steps by which the paper's controller moves objects of all three kinds along the figure's times."""
     (model, *_) = paper_models(context, largest=False)
     scene = ab.Scene(context.device)
     for importance in (1, 2, 3):
@@ -46,11 +46,11 @@ def step_figure_4(context):
     for frame in range(len(COURSE)):
         for kind in range(3):
             row = {"case": "figure 4", "frame": frame + 1, "kind": f"Q{kind + 1}"}
-            yield row | {"moved": moved[frame, kind], "paper": FIGURE_4[kind][frame]}
+            yield row | {"moved": abs(moved[frame, kind]), "paper": FIGURE_4[kind][frame]}
 
 
-def trace_budget(context):
-    """Yield one row a controller and frame of the focus scene, and one a controller.
+def hold_budget(context):
+    """Yield one row a controller of the focus scene.
 
     T is a third of the median frame at the finest levels. Times are counted work (`WorkClock`), so that the run repeats
     everywhere; the case `budget` measures.
@@ -65,15 +65,7 @@ def trace_budget(context):
         context.progress(f"{controller} controller")
         frame = loaded.frame(controller=controller, budget_ms=budget, clock=WorkClock())
         frame.run(frames)
-        for row in frame.history[::2]:
-            cost = {"cost": row.total_ms / budget, "faces": row.faces}
-            yield {"case": "trace", "controller": controller, "time": row.time} | cost
         judged = budget_report(frame.history, budget, after=AFTER)
         about = {"case": "budget", "controller": controller, "objects": loaded.scene.object_count}
         about |= {name: judged[name] for name in ("frames", "within", "worst", "error_mean")}
         yield about | {"within_110_percent": judged["within_110_percent"], "oscillations": judged["oscillations"]}
-
-
-def step_sizes(rows):
-    """Return the rows with the sizes of steps, as figure 4 shows them."""
-    return [row | {"moved": abs(row["moved"])} if "moved" in row else row for row in rows]

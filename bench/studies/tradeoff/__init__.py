@@ -21,5 +21,4 @@ SUMMARIES = {
     "over_workloads": summaries.over_workloads,
     "distances": partial(summaries.summarise, names=("method", "setting", "where")),
     "motions": partial(summaries.summarise, names=("method", "setting")),
-    "refined": partial(summaries.summarise, names=("value", "asked")),
 }

@@ -3,9 +3,6 @@
 Poses lie along the motions, `GAPS` before the first contact. Each search starts anew. A LOD proves that the originals
 are no nearer than its distance less both certified errors, a tolerance that they are no nearer than its bracket's lower
 end: `proved` is how far below the distance that is, on average.
-
-Refining asks a LOD with half of what is asked, and the finest LODs about the pairs that this leaves undecided. It is
-given the nearest faces of the originals as the upper bound, so that no way to find some can decide more.
 """
 
 import numpy as np
@@ -21,8 +18,6 @@ GAPS = (0.3, 0.1, 0.03, 0.01)  # of the size, from the first contact
 FRACTIONS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
 QUICK_FRACTIONS = (0.02, 0.1, 1)
 RELATIVE = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
-REFINED = (0.01, 0.1)  # fractions of the faces
-ASKED = ({"relative": 0.5}, {"relative": 0.2}, {"relative": 0.05}, {"tolerance": 0.1}, {"tolerance": 0.03})
 OURS, OURS_FCL, TOLERANCE = "our LODs", "our LODs, python-fcl", "tolerance at the finest LODs"
 
 
@@ -44,13 +39,13 @@ class Distances:
         self._scenes = {}
         self.truth = self.ask((workload.a.lod_max, workload.b.lod_max)).run().distance
 
-    def ask(self, lods, which=slice(None), **options):
-        """Return a query of some poses at LODs."""
+    def ask(self, lods, **options):
+        """Return a query of all poses at LODs."""
         if lods not in self._scenes:
             self._scenes[lods] = self.workload.scene(lods, len(self.poses))
             self._scenes[lods].place(self.poses)
         scene = self._scenes[lods]
-        return ab.DistanceQuery(scene.scene, scene.pairs[: len(self.poses)][which], **options)
+        return ab.DistanceQuery(scene.scene, scene.pairs[: len(self.poses)], **options)
 
     def lods(self, fraction):
         """Return LODs of a fraction of the faces, 1 for the finest."""
@@ -110,36 +105,7 @@ def measure_fcl(distances) -> dict:
     return rows
 
 
-def measure_refining(distances):
-    """Return rows of refining from a LOD, beside the finest LODs at once, with their times."""
-    workload, rows, queries = distances.workload, [], {}
-    for value in REFINED:
-        lods = distances.lods(value)
-        errors = workload.bound(lods)
-        for options in ASKED:
-            asked = {name: x * (workload.size if name == "tolerance" else 1) for name, x in options.items()}
-            coarse = distances.ask(lods, **{name: x / 2 for name, x in asked.items()})
-            lower = coarse.run().bracket[:, 0] - errors
-            width = np.maximum(asked.get("tolerance", 0.0), asked.get("relative", 0.0) * distances.truth)
-            left = np.flatnonzero((lower <= 0) | (distances.truth - lower > width))
-            number, words = len(rows), " ".join(f"{name} {x}" for name, x in options.items())
-            queries[number, "lods"] = coarse
-            queries[number, "finest"] = distances.ask(distances.lods(1), **asked)
-            if len(left):
-                queries[number, "left"] = distances.ask(distances.lods(1), left, **asked)
-            decided = 1 - len(left) / len(distances.truth)
-            row = {"case": "refine", "workload": workload.name, "value": value, "asked": words, "decided": decided}
-            rows.append(row | {"bound": errors / workload.size, "left_us": 0.0})
-    for query in queries.values():
-        query.run()
-    for (number, name), us in distances.time(queries).items():
-        rows[number][f"{name}_us"] = us
-    return [row | {"refine_cost": (row["lods_us"] + row["left_us"]) / row["finest_us"]} for row in rows]
-
-
 def run(context):
-    """Yield one row a workload, method and setting, and one a workload, LOD and tolerance that is refined from it."""
+    """Yield one row a workload, method and setting."""
     for workload in workloads(context):
-        distances = Distances(context, workload)
-        yield from measure_levels(distances)
-        yield from measure_refining(distances)
+        yield from measure_levels(Distances(context, workload))

@@ -6,7 +6,7 @@ from ...tables import pick
 
 SUMMED = ("poses", "meet", "missed", "invented", "undecided", "hits", "faces_missed", "faces_invented")
 LARGEST = ("early_max", "late_max", "contact_max", "region_hausdorff_max", "distance_max")
-RATIOS = ("us", "cost", "build_s", "of_finest", "any_cost", "contacts_cost", "refine_cost")
+RATIOS = ("us", "cost", "build_s", "of_finest", "any_cost", "contacts_cost")
 TESTS = ("node_tests", "contacts_node_tests")
 RATIOS += tuple(f"{name}_cost" for name in TESTS)
 SHOWN_OFFSETS = (0.01, 0.1, 0.5)  # fractions of the faces
