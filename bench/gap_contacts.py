@@ -7,15 +7,12 @@ import warp as wp
 
 import warp_abtree as ab
 
-from .shapes import knot, longest_side, pair_poses, scene_of_pairs
+from .shapes import KNOT_PAIRS, knot, knot_batches, longest_side, pair_poses, scene_of_pairs
 from .timing import medians, no_garbage_collection, one_core, ratio_of, time_in_turn
 
-FULL = {"faces": 5000, "pairs": (64, 1024, 8192), "distances": (0.9, 0.2), "repeats": 15}
-CPU = FULL | {"pairs": (64,)}
+FULL = KNOT_PAIRS | {"pairs": (64, 1024, 8192)}
 QUICK = {"faces": 300, "pairs": (4,), "distances": (0.2,), "repeats": 2}
 GAPS = 0.0, 1e-4, 3e-4, 1e-3, 3e-3  # of the mesh's size
-PAIRS_MAX_CLOSE = 1024  # more have too many contacts where meshes are that near
-FAR = 0.9
 
 
 def run(device, quick=False):
@@ -25,12 +22,10 @@ def run(device, quick=False):
     search_ratio of those alone that find the faces. On a CPU on one core.
     """
     device = wp.get_device(device)
-    sizes = QUICK if quick else CPU if device.is_cpu else FULL
+    sizes = QUICK if quick else FULL
     model = ab.Model.from_arrays(*knot(sizes["faces"]), name="knot")
-    for count in sizes["pairs"]:
-        for distance in sizes["distances"]:
-            if distance >= FAR or count <= PAIRS_MAX_CLOSE:
-                yield from time_gaps(device, model, count, distance, sizes["repeats"])
+    for count, distance in knot_batches(device, sizes):
+        yield from time_gaps(device, model, count, distance, sizes["repeats"])
 
 
 def time_gaps(device, model, count, distance, repeats):
@@ -43,12 +38,12 @@ def time_gaps(device, model, count, distance, repeats):
     plain = scene.intersect(pairs, output="contacts")
     queries, found = {}, {}
     for gap in (None, *GAPS):
-        result = scene.intersect(pairs, output="contacts", gap=None if gap is None else gap * longest_side(model))
+        asked = None if gap is None else gap * longest_side(model)
+        result = scene.intersect(pairs, output="contacts", gap=asked)
         rows = result.contacts if gap is None else result.contacts[result.contacts["separation"] < 0]
         if rows["faces"].tobytes() != plain.contacts["faces"].tobytes():
             raise RuntimeError("with a gap other faces intersect")
         found[gap] = len(result.contacts)
-        asked = None if gap is None else gap * longest_side(model)
         queries[gap] = ab.ContactQuery(scene, pairs, capacity=max(1, found[gap]), gap=asked)
         queries[gap].grow()
     with one_core(), no_garbage_collection():
@@ -58,7 +53,6 @@ def time_gaps(device, model, count, distance, repeats):
     middle = medians(times)
     for gap in GAPS:
         row = {"device": device.name, "pairs": count, "distance": distance, "gap": gap, "contacts": found[gap]}
-        row |= {"more": round(found[gap] / max(1, found[None]), 3)}
-        row |= {"without_ms": round(middle[None], 4), "with_ms": round(middle[gap], 4)}
+        row |= {"more": found[gap] / max(1, found[None]), "without_ms": middle[None], "with_ms": middle[gap]}
         row |= {"ratio": ratio_of(times[gap], times[None]), "search_ratio": ratio_of(search[gap], search[None])}
-        yield row | {"meet": int(np.count_nonzero(plain.any))}
+        yield row | {"meet": np.count_nonzero(plain.any)}

@@ -27,13 +27,8 @@ DIGITS = 5  # significant ones of a number that is kept
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 DASHES = ("-", "--", ":", "-.")
-STYLE = {
-    "svg.hashsalt": "warp_abtree",
-    "svg.fonttype": "none",
-    "font.size": 9,
-    "lines.markersize": 4,
-    "lines.linewidth": 1.4,
-}
+STYLE = {"svg.hashsalt": "warp_abtree", "svg.fonttype": "none"}
+STYLE |= {"font.size": 9, "lines.markersize": 4, "lines.linewidth": 1.4}
 PANEL = (4.6, 3.9)  # inches
 
 
@@ -51,13 +46,10 @@ def pick(rows, **where) -> list:
 
 def plain(value):
     """Return a value of a row as JSON keeps it: floats to `DIGITS` significant digits, no NaN."""
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, int | np.integer):
-        return int(value)
-    if isinstance(value, float | np.floating):
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, float):
         return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None
-    if value is None or isinstance(value, str):
+    if value is None or isinstance(value, bool | int | str):
         return value
     raise TypeError(f"a row holds a {type(value).__name__}")
 
@@ -76,10 +68,8 @@ def write_json(path, study):
 
 def shown(value, form="") -> str:
     """Return a value as a table prints it."""
-    if value is None:
-        return "-"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
+    if value is None or isinstance(value, bool):
+        return {None: "-", True: "yes", False: "no"}[value]
     return value.replace("|", "\\|") if isinstance(value, str) else format(value, form)
 
 
@@ -89,18 +79,17 @@ def select_rows(layout, study):
     A layout's `rows` are texts, each with the values of one row of the study in it.
     """
     if "rows" in layout:
-        names = [name for name, *_ in layout["columns"]]
-        return [dict(zip(names, show_row(row, study), strict=True)) for row in layout["rows"]]
+        return [show_row(row, layout["columns"], study) for row in layout["rows"]]
     rows = pick(study["parts"].get(layout["part"], {"rows": []})["rows"], **layout.get("where", {}))
     if rows and "select" in layout:
         rows = importlib.import_module(f"bench.studies.{study['study']}").SUMMARIES[layout["select"]](rows)
     return rows
 
 
-def show_row(layout, study) -> list:
+def show_row(layout, columns, study) -> dict:
     """Return the texts of a row, its values filled in."""
     (row,) = pick(study["parts"][layout["part"]]["rows"], **layout["where"])
-    return [text.format(**row) for text in layout["show"]]
+    return {name: text.format(**row) for (name, _), text in zip(columns, layout["show"], strict=True)}
 
 
 def markdown_table(layout, study, short=None) -> str:
@@ -109,12 +98,13 @@ def markdown_table(layout, study, short=None) -> str:
     rows = pick(select_rows(layout, study), **short.get("where", {}))
     if not rows:
         return "Not measured in this run."
-    columns = [(name, heading, *form, "")[:3] for name, heading, *form in layout["columns"]]
-    columns = [column for column in columns if column[0] in short.get("columns", [column[0]])]
-    left = [any(isinstance(row.get(name), str) for row in rows) for name, _, _ in columns]
-    lines = [[heading for _, heading, _ in columns], ["---" if is_left else "--:" for is_left in left]]
-    lines += [[shown(row.get(name), form) for name, _, form in columns] for row in rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    columns = []
+    for name, heading, *form in layout["columns"]:
+        if name in short.get("columns", [name]):
+            values = [row.get(name) for row in rows]
+            rule = "---" if any(isinstance(value, str) for value in values) else "--:"
+            columns.append([heading, rule, *(shown(value, *form) for value in values)])
+    return "\n".join("| " + " | ".join(line) + " |" for line in zip(*columns))
 
 
 def markdown_run(study) -> str:
@@ -248,9 +238,9 @@ def find_lines(rows, panel) -> dict:
 
 def draw_panel(axes, panel, lines):
     columns, parts = list(panel["y"]), panel.get("order") or list(dict.fromkeys(part for _, part in lines))
-    for set_scale, name in ((axes.set_xscale, "xscale"), (axes.set_yscale, "yscale")):
-        scale = panel.get(name, "log")
-        set_scale(scale, **({"linthresh": panel["least"], "linscale": 0.4} if scale == "symlog" else {}))
+    axes.set_xscale(panel.get("xscale", "log"))
+    scale = panel.get("yscale", "log")
+    axes.set_yscale(scale, **({"linthresh": panel["least"], "linscale": 0.4} if scale == "symlog" else {}))
     for (column, part), points in lines.items():
         x, y = zip(*(points if panel.get("unsorted") else sorted(points)), strict=True)
         name = f"{part:,} {panel['unit'].removesuffix('s' if part == 1 else '')}" if "unit" in panel else part

@@ -1,9 +1,8 @@
 """Newton's mesh-mesh narrow phase, where the package `newton` is installed: by BVH, and by SDF (CUDA only).
 
 Another question, and an approximate answer: it looks for points of the edges of one mesh inside the other and keeps a
-few contacts a pair, without face numbers, so only whether a pair intersects can be compared. All shapes share one mesh,
-or the first and the second of each pair; margins and gaps are 0, so that contacts are those of surfaces that pass
-through each other.
+few contacts a pair, without face numbers, so only whether a pair intersects can be compared. All shapes share one mesh;
+margins and gaps are 0, so that contacts are those of surfaces that pass through each other.
 """
 
 import warnings
@@ -47,7 +46,6 @@ class Newton(Pipeline):
 
     Args:
         poses: Float32 (2 p, 7), the two objects of a pair one after the other.
-        other: Vertices and faces of the first object of each pair; None is the same mesh.
         hits: About how many face pairs intersect, for the size of its buffers.
         sdf: Voxels along the longest side of a signed distance field, 0 for the BVH.
 
@@ -55,21 +53,17 @@ class Newton(Pipeline):
         ImportError: Newton is not installed.
     """
 
-    def __init__(self, vertices, faces, poses, hits, device, sdf=0, other=None):
+    def __init__(self, vertices, faces, poses, hits, device, sdf=0):
         import newton
 
         self.pair_count = len(poses) // 2
-        meshes = []
-        for points, corners in [(vertices, faces)] if other is None else [other, (vertices, faces)]:
-            mesh = newton.Mesh(points, corners.reshape(-1), compute_inertia=False)
-            if sdf:
-                mesh.build_sdf(device=device, max_resolution=sdf)
-            meshes.append(mesh)
+        mesh = newton.Mesh(vertices, faces.reshape(-1), compute_inertia=False)
+        if sdf:
+            mesh.build_sdf(device=device, max_resolution=sdf)
         builder = newton.ModelBuilder()
         config = newton.ModelBuilder.ShapeConfig(density=0.0, margin=0.0, gap=0.0)
-        for i, pose in enumerate(poses.tolist()):
-            body = builder.add_body(xform=wp.transform(*pose), mass=1.0)
-            builder.add_shape_mesh(body, mesh=meshes[i % len(meshes)], cfg=config)
+        for pose in poses.tolist():
+            builder.add_shape_mesh(builder.add_body(xform=wp.transform(*pose), mass=1.0), mesh=mesh, cfg=config)
         pairs = wp.array(np.arange(2 * self.pair_count).reshape(-1, 2), dtype=wp.vec2i, device=device)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of inertia, and of large buffers

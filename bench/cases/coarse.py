@@ -8,14 +8,11 @@ import warp as wp
 import warp_abtree as ab
 
 from ..baselines.wp_bvh import BvhPosed, find_constructor
-from ..shapes import knot, pair_poses, scene_of_pairs
+from ..shapes import FAR, KNOT_PAIRS, knot, knot_batches, pair_poses, scene_of_pairs
 from ..timing import ratio_of, summarise, time_in_turn
 
-FULL = {"faces": 5000, "pairs": (1, 64, 1024, 8192), "distances": (0.9, 0.2), "repeats": 15}
 QUICK = {"faces": 300, "pairs": (2,), "distances": (0.2,), "repeats": 3}
 FRACTIONS = (1.0, 0.1, 0.01)  # of the faces
-# More than these take minutes on the CPU, or where the meshes are nearer than this.
-PAIRS_MAX_CLOSE, PAIRS_MAX_CPU, FAR = 1024, 64, 0.9
 
 
 def run(device, quick=False):
@@ -24,17 +21,15 @@ def run(device, quick=False):
     faces are those active at the LOD; ratios are the baseline's times over ours, contact_ratio contacts over faces.
     """
     device = wp.get_device(device)
-    sizes = QUICK if quick else FULL
+    sizes = QUICK if quick else KNOT_PAIRS
     mesh = knot(sizes["faces"])
     model = ab.Model.from_arrays(*mesh)
     constructor = find_constructor(*mesh, pair_poses(min(64, max(sizes["pairs"])), FAR), device)
-    for pair_count in sizes["pairs"]:
-        for distance in sizes["distances"]:
-            limit = PAIRS_MAX_CPU if device.is_cpu else PAIRS_MAX_CLOSE if distance < FAR else max(sizes["pairs"])
-            for fraction in FRACTIONS if pair_count <= limit else ():
-                poses = pair_poses(pair_count, distance)
-                row = {"device": device.name, "pairs": pair_count, "distance": distance, "fraction": fraction}
-                yield row | run_batch(device, model, fraction, poses, constructor, sizes["repeats"])
+    for pair_count, distance in knot_batches(device, sizes):
+        for fraction in FRACTIONS:
+            row = {"device": device.name, "pairs": pair_count, "distance": distance, "fraction": fraction}
+            poses = pair_poses(pair_count, distance)
+            yield row | run_batch(device, model, fraction, poses, constructor, sizes["repeats"])
 
 
 def mesh_at(model, lod):
@@ -61,7 +56,7 @@ def run_batch(device, model, fraction, poses, constructor, repeats):
     launches["peer_faces"] = BvhPosed(*mesh, poses, 2 * hits + 1024, device, constructor).launch
     launches["peer_any"] = BvhPosed(*mesh, poses, None, device, constructor).launch
     times = time_in_turn(launches, device, repeats)
-    row = {"faces": len(mesh[1]), "hits": hits, "node_tests": int(found["faces"].node_tests.sum())}
+    row = {"faces": len(mesh[1]), "hits": hits, "node_tests": found["faces"].node_tests.sum()}
     row |= {"peer": f"wp.Bvh {constructor}"} | summarise(times)
     row |= {f"{output}_ratio": ratio_of(times[f"peer_{output}"], times[output]) for output in ("faces", "any")}
     return row | {"contact_ratio": ratio_of(times["contacts"], times["faces"])}

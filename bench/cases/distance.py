@@ -10,6 +10,7 @@ The part `gap` is contacts with a gap: `bench.gap_contacts`.
 """
 
 import time
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -28,7 +29,6 @@ FULL = {"poses": 32, "counts": (1, 1024, 65536), "knot": 5000, "repeats": 7}
 CPU = FULL | {"counts": (1, 1024)}
 QUICK = {"poses": 3, "counts": (3,), "knot": 300, "repeats": 1}
 PARTS = ("nearest", "gap")
-IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 MESHES = ("cow", "rocker-arm", "stanford-bunny")
 NUT = ("factory-bolt-m20", "factory-nut-m20")
 BASES = ("fresh", "fcl"), ("again", "fcl"), ("calls", "fcl"), ("one", "fcl_one"), ("one_graph", "fcl_one")
@@ -67,8 +67,7 @@ def measure(name, models, matrices, device, repeats):
     Raises:
         RuntimeError: A baseline's distance is another, by more than float64's rounding of the sizes.
     """
-    scene, pairs = scene_of_poses(device, *models, [IDENTITY] * len(matrices))
-    scene.set_poses(np.concatenate([np.eye(4)[None], matrices]))
+    scene, pairs = scene_of_poses(device, *models, matrices)
     query, fresh = ab.DistanceQuery(scene, pairs), ab.DistanceQuery(scene, pairs)
     middle = slice(len(pairs) // 2, len(pairs) // 2 + 1)
     one = ab.DistanceQuery(scene, pairs[middle])
@@ -77,17 +76,9 @@ def measure(name, models, matrices, device, repeats):
     for _ in range(LAUNCHES_BEFORE):
         one.launch()
     row = {"device": device.name, "workload": name, "faces": " x ".join(str(model.face_count) for model in models)}
-    row |= {"poses": len(pairs), "meet": int(found.any.sum()), "median_gap": float(np.median(found.distance))}
-    row |= {"node_tests": round(found.node_tests.mean(), 1), "face_tests": round(found.triangle_tests.mean(), 1)}
-
-    def launch_fresh():
-        fresh.forget()
-        fresh.launch()
-
-    def launch_one():
-        one.forget()
-        one.launch()
-
+    row |= {"poses": len(pairs), "meet": found.any.sum(), "median_gap": np.median(found.distance)}
+    row |= {"node_tests": found.node_tests.mean(), "face_tests": found.triangle_tests.mean()}
+    launch_fresh, launch_one = (partial(launch_anew, query) for query in (fresh, one))
     with one_core(), testing.regime(cpu_threads=1):
         # Either comes after a whole batch: what it needs is as far from the core.
         launches = {"fresh": launch_fresh}
@@ -104,16 +95,19 @@ def measure(name, models, matrices, device, repeats):
         with no_garbage_collection():
             times = medians(time_in_turn(launches, device, repeats, time.thread_time))
     per = {key: time if "one" in key else time / len(pairs) for key, time in times.items()}
-    row |= {f"{key}_ms": float(f"{value:.4g}") for key, value in per.items()}
-    for key, base in BASES:
-        if base in per:
-            row[f"{key}_fcl_ratio"] = round(per[base] / per[key], 2)
-    return row
+    row |= {f"{key}_ms": value for key, value in per.items()}
+    return row | {f"{key}_fcl_ratio": round(per[base] / per[key], 2) for key, base in BASES if base in per}
+
+
+def launch_anew(query):
+    """Launch a query whose searches start anew."""
+    query.forget()
+    query.launch()
 
 
 def make_calls(models, matrices, device):
     """Return a callable that brings one pair from pose to pose, and reads its distance at each."""
-    scene, pairs = scene_of_poses(device, *models, [IDENTITY])
+    scene, pairs = scene_of_poses(device, *models, matrices[:1])
     query = ab.DistanceQuery(scene, pairs)
     poses = [np.stack([np.eye(4), matrix]) for matrix in matrices]
 
@@ -135,5 +129,5 @@ def make_fcl(models, matrices, found, row):
     size = max(longest_side(model) for model in models)
     if error > 1e-12 * size:
         raise RuntimeError(f"python-fcl's distances differ by {error / size} of the size")
-    row["fcl_differs"] = float(f"{error / size:.2g}")
+    row["fcl_differs"] = error / size
     return fcl

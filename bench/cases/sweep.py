@@ -41,17 +41,12 @@ def run(device, quick=False):
                 yield about | run_case(device, model, poses, sizes["repeats"])
 
 
-def mposes(count, milliseconds):
-    """Return million poses a second."""
-    return float(f"{count / milliseconds / 1e3:.4g}")
-
-
 def run_launch(device, model, poses, repeats):
     """Return the columns of launches over posed objects."""
     scene, pairs = scene_of_poses(device, model, model, poses)
     query = ab.Query(scene, "any", pairs=pairs)
     result = query.run()
-    row = {"meet": round(float(result.any.mean()), 4)} | memory_columns(scene, query)
+    row = {"meet": result.any.mean()} | memory_columns(scene, query)
     mesh = model.mesh_at(model.lod_max)[:2]
     both = np.zeros((2 * len(poses), 7), np.float32)
     both[::2, 6], both[1::2] = 1, poses
@@ -63,9 +58,9 @@ def run_launch(device, model, poses, repeats):
         raise RuntimeError("the timed query's answer differs from the checked one")
     baseline.launch()
     found = baseline.result()
-    row |= {"peer_missed": int((result.any & ~found).sum()), "peer_invented": int((found & ~result.any).sum())}
+    row |= {"peer_missed": (result.any & ~found).sum(), "peer_invented": (found & ~result.any).sum()}
     row |= summarise(times) | {"ratio": ratio_of(times["peer"], times["launch"])}
-    return row | {"launch_mposes_s": mposes(len(poses), row["launch_ms"])}
+    return row | {"launch_mposes_s": len(poses) / row["launch_ms"] / 1e3}
 
 
 def run_sweep(device, model, poses, repeats):
@@ -80,8 +75,8 @@ def run_sweep(device, model, poses, repeats):
         kind: time_call(lambda rows=rows: ab.sweep(model, model, rows, device=device), device)
         for kind, rows in kinds.items()
     }
-    row = {"meet": round(float(answers["sweep32"].mean()), 4)} | summarise(time_rounds(runs, min(repeats, 5)))
-    rates = {f"{kind}_mposes_s": mposes(len(poses), row[f"{kind}_ms"]) for kind in kinds}
+    row = {"meet": answers["sweep32"].mean()} | summarise(time_rounds(runs, min(repeats, 5)))
+    rates = {f"{kind}_mposes_s": len(poses) / row[f"{kind}_ms"] / 1e3 for kind in kinds}
     return row | rates | used_memory(device)
 
 

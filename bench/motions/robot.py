@@ -106,8 +106,8 @@ def run_any(device, clock, robot, around, configurations, sizes):
         "ours": time_call(lambda: robot.check(configurations, around), device, clock),
         "fcl": time_call(lambda: fcl_robot.any(poses), clock=clock),
     }
-    row = {"output": "any", "configurations": len(configurations), "meet": round(float(found.mean()), 4)}
-    row["differ_from_fcl"] = int((fcl_robot.any(poses) != found[: len(some)]).sum())
+    row = {"output": "any", "configurations": len(configurations), "meet": found.mean()}
+    row["differ_from_fcl"] = (fcl_robot.any(poses) != found[: len(some)]).sum()
     row |= summarise(time_rounds(runs, sizes["repeats"]))
     row["configurations_s"] = round(1e3 * len(configurations) / row["ours_ms"])
     return row | {"fcl_configurations_s": round(1e3 * len(some) / row["fcl_ms"])}
@@ -127,6 +127,6 @@ def run_edges(device, clock, robot, around, free):
     ends = starts + 0.05 * (free[len(free) // 2 :][: len(starts)] - starts)
     rows = robot.check_edges(starts, ends, around)
     times = time_rounds({"ours": time_call(lambda: robot.check_edges(starts, ends, around), device, clock)}, 1)
-    row = {"output": "edges", "configurations": len(starts), "clear": round(float(rows["clear"].mean()), 4)}
-    row |= {"undecided": round(float(rows["undecided"].mean()), 4)} | summarise(times)
+    row = {"output": "edges", "configurations": len(starts), "clear": rows["clear"].mean()}
+    row |= {"undecided": rows["undecided"].mean()} | summarise(times)
     return row | {"edges_s": round(1e3 * len(starts) / row["ours_ms"])}

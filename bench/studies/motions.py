@@ -118,7 +118,9 @@ class PoseScene:
         """Return whether A and B are not proved farther apart than a distance, at each pose."""
         return ~self._ask(poses, "apart", np.broadcast_to(np.asarray(within, float), len(poses)))
 
-    def ask(self, poses, output):
-        """Return the `ab.Result` at poses, no more than there is room for."""
+    def query(self, poses, output, **options):
+        """Return a query of poses, which are placed; its first run makes room for what it finds."""
         self.place(poses)
-        return self.scene.intersect(self.pairs[: len(poses)], output)
+        make = {"contacts": ab.ContactQuery, "distance": ab.DistanceQuery}.get(output)
+        asked = {} if make else {"output": output}
+        return (make or ab.Query)(self.scene, pairs=self.pairs[: len(poses)], **asked, **options)

@@ -1,14 +1,13 @@
 """The measures of benchmarks and studies on cases known by hand."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
 
 import warp_abtree as ab
-from bench import roofline, timing
+from bench import timing
 from bench.cases.update import bound_nodes, find_crossover
 from bench.studies.motions import Motions, PoseScene, find_first_contact
 from bench.studies.paper import update
@@ -23,21 +22,6 @@ def test_slope_and_crossover():
     rows = [{"k": k, "update_ms": k / 100, "full_ms": 1.0} for k in (1, 10, 80, 125, 1000)]
     found = [find_crossover(some, "k") for some in (rows, rows[:3], rows[3:])]
     assert found == [pytest.approx(100), None, 125] and timing.crossover([0.1, 1.0], [1.0, 2.0], 0.0) == 0.0
-
-
-def test_work_of_a_result():
-    """1,000 node tests at 32 bytes and 64 operations, a pair of 400 bytes; 100 triangle tests, 10 of them hits."""
-    counters = {"node_tests": 1000, "triangle_tests": 100, "float64_tests": 3, "exact_tests": 1, "count": 10}
-    result = SimpleNamespace(pairs=(0,), **{name: np.array([value]) for name, value in counters.items()})
-    size, single, double = roofline.count_work(result)
-    assert size == 32 * 1000 + 128 * 100 + 176 * 3 + 176 + 400 + 12 * 10
-    assert single == 64 * 1000 + 140 * 100 + 152 * 7 and double == 129 * 3 + 373
-    row = roofline.roofline(result, 1.0, (1e9, 1e9, 1e9))
-    assert row["memory_share"] == pytest.approx(1e-6 * size, rel=0.01) and row["node_tests_per_s"] == 1e6
-    assert "memory_share" not in roofline.roofline(result, 1.0, None)
-    names = ("NVIDIA H200", "NVIDIA H100 80GB HBM3", "NVIDIA H100 PCIe", "CPU")
-    found = [roofline.find_peaks(SimpleNamespace(name=name)) for name in names]
-    assert [peaks and peaks[0] for peaks in found] == [4.8e12, 3.35e12, 2.0e12, None]
 
 
 def test_fit_of_figure_6():

@@ -114,10 +114,6 @@ def check_settings(rows):
     assert laid["faces_missed"] > 0 and laid["faces_invented"] > 0
     (touching,) = pick(rows, case="precision", setting="exact", poses_kind="at first contact", value=1)
     assert touching["meet"] == touching["poses"] / 2, "one side of each first contact meets, exactly"
-    for value in (0.1, 1):
-        tests = [pick(rows, case="output", setting=name, value=value)[0]["node_tests"] for name in settings.OUTPUTS]
-        # Warps take many node pairs at once: a query of few may end with the last of them.
-        assert tests[0] <= tests[1] == tests[2] == tests[3]
     margins = pick(rows, case="margin", value=0.1)
     assert [row["factor"] for row in margins] == list(settings.FACTORS)
     assert margins[0]["recall"] < 1 and all(row["recall"] == 1 and not row["late_max"] for row in margins[3:])

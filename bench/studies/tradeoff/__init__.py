@@ -16,7 +16,6 @@ SUMMARIES = {
     "choose": summaries.choose,
     "by_offset": summaries.by_offset,
     "precisions": summaries.precisions,
-    "outputs": partial(summaries.summarise, names=("value", "setting")),
     "margins": partial(summaries.summarise, names=("value", "factor")),
     "over_workloads": summaries.over_workloads,
     "distances": partial(summaries.summarise, names=("method", "setting", "where")),

@@ -13,12 +13,10 @@ import numpy as np
 import trimesh
 import warp as wp
 
-import warp_abtree as ab
-
 from ...baselines.fcl import Fcl
 from ...baselines.newton import Newton
 from ...shapes import pose_matrices
-from .workload import find_front, judge_answers, judge_contact, workloads
+from .workload import find_front, judge_answers, judge_contact, time_rows, workloads
 
 FRACTIONS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
 QUICK_FRACTIONS = (0.02, 0.1, 0.5, 1)
@@ -70,8 +68,7 @@ def our_points(context, workload):
         about = {"share": workload.fraction(lods), "where": "GPU" if context.device.is_cuda else "CPU core"}
         scene = workload.scene(lods)
         row = measure(workload, OURS, f"{value:.3g} of the faces", scene.intersects, **about)
-        scene.place(poses)
-        query = ab.Query(scene.scene, "any", pairs=scene.pairs[: len(poses)])
+        query = scene.query(poses, "any")
         query.run()
         yield row, query.launch
 
@@ -118,7 +115,7 @@ def newton_points(context, workload):
     if context.library("newton") is None:
         return
     poses = workload.timed_poses(NEWTON_POSES)
-    hits = int(workload.finest.ask(workload.poses, "count").count.sum()) * (len(poses) // len(workload.poses))
+    hits = workload.finest.query(workload.poses, "count").run().count.sum() * (len(poses) // len(workload.poses))
     for sdf in SDF_RESOLUTIONS:
         setting = f"{sdf} voxels"
         try:
@@ -157,9 +154,6 @@ def time_points(context, workload, found):
     rows = [row for row, _ in found]
     for on_gpu in (False, True):
         mine = {k: launch for k, (row, launch) in enumerate(found) if launch and (row["where"] == "GPU") == on_gpu}
-        times = context.time_launches(mine, on_core=not on_gpu) if mine else {}
-        count = len(workload.timed_poses() if on_gpu else workload.poses)
-        for k, milliseconds in times.items():
-            rows[k]["us"] = 1e3 * milliseconds / count
+        time_rows(context, rows, mine, len(workload.timed_poses() if on_gpu else workload.poses), on_core=not on_gpu)
     fronts = find_front([row["us"] for row in rows], [row["contact_mean"] for row in rows])
     return [row | {"front": front} for row, front in zip(rows, fronts, strict=True)]

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-import warp_abtree as ab
-
 from .regions import compare_normals, compare_regions, make_regions, resultants
 from .workload import judge_answers, judge_contact, workloads
 
@@ -20,7 +18,7 @@ class LodLevels:
 
     def __init__(self, workload):
         self.workload = workload
-        self.exact = workload.finest.ask(workload.poses, "contacts")
+        self.exact = workload.finest.query(workload.poses, "contacts").run()
         self.exact.check()
         if not np.array_equal(self.exact.any, workload.truth):
             raise RuntimeError("outputs 'any' and 'contacts' differ at the finest LODs")
@@ -32,7 +30,7 @@ class LodLevels:
         """Add the row of a level, times aside; yield one row a distance from the first contact."""
         workload, exact = self.workload, self.exact
         scene = workload.scene(lods)
-        found = scene.ask(workload.poses, "contacts")
+        found = scene.query(workload.poses, "contacts").run()
         error = workload.first_contact(scene.intersects)
         bound = workload.bound(lods) / workload.size
         row = {"case": "level", "workload": workload.name, "kind": kind, "value": value}
@@ -43,7 +41,7 @@ class LodLevels:
         row |= compare_regions(make_regions(found.contacts, len(workload.poses), workload.size), self.regions)
         row |= compare_normals(found.pair_contacts, exact.pair_contacts, self.clear)
         row |= {"contacts": len(found.contacts), "contacts_node_tests": float(found.node_tests.mean())}
-        row["node_tests"] = float(scene.ask(workload.poses, "any").node_tests.mean())
+        row["node_tests"] = scene.query(workload.poses, "any").run().node_tests.mean()
         self.rows.append(row)
         self.scenes.append(scene)
         for offset in np.unique(workload.offset) if kind == "fraction" else ():
@@ -55,14 +53,9 @@ class LodLevels:
         """Return the rows with their times, taken in turn."""
         poses, launches = self.workload.timed_poses(), {}
         for number, (row, scene) in enumerate(zip(self.rows, self.scenes, strict=True)):
-            scene.place(poses)
-            pairs = scene.pairs[: len(poses)]
             room = max(1024, row["contacts"] * (len(poses) // len(self.workload.poses)))
-            queries = {
-                "any": ab.Query(scene.scene, "any", pairs=pairs),
-                "contacts": ab.ContactQuery(scene.scene, pairs, capacity=room),
-            }
-            for output, query in queries.items():
+            for output, options in {"any": {}, "contacts": {"capacity": room}}.items():
+                query = scene.query(poses, output, **options)
                 query.run().check()
                 launches[number, output] = query.launch
         for (number, output), milliseconds in context.time_launches(launches).items():

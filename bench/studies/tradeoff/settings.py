@@ -1,4 +1,4 @@
-"""Cost and error of the other settings: precision, output, and a margin around the surfaces.
+"""Cost and error of the other settings: precision, and a margin around the surfaces.
 
 Boxes have no setting of their own: their margin covers rounding, and no answer depends on it. What widens them on
 purpose is `within=`: pairs that are not proved farther apart than a distance count as intersecting, so that a coarse
@@ -7,28 +7,15 @@ LOD with `within` of both errors misses nothing. It is measured here as the marg
 
 import numpy as np
 
-import warp_abtree as ab
-
 from ...verify import count_differences
 from .workload import judge_answers, judge_contact, workloads
 
 PRECISIONS = ("exact", "float32")
-OUTPUTS = ("any", "count", "faces", "contacts")
-FRACTIONS = (0.01, 0.05, 0.2, 1)
 PRECISION_FRACTIONS = (0.1, 1)
 MARGIN_FRACTIONS = (0.02, 0.1, 0.5)
 FACTORS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of both errors
 COINCIDENT_FACES = 25_000  # larger meshes are not laid on themselves: a million face pairs a pose
 COINCIDENT_ULPS = (0, 1, -3, 50)
-
-
-def make_query(scene, poses, output, **options):
-    """Return a query of placed poses, whose first run makes room for what it finds."""
-    scene.place(poses)
-    pairs = scene.pairs[: len(poses)]
-    return (
-        ab.ContactQuery(scene.scene, pairs) if output == "contacts" else ab.Query(scene.scene, output, pairs, **options)
-    )
 
 
 def coincident_poses(size):
@@ -45,7 +32,7 @@ def precision_rows(context, workload, scenes):
         groups["coincident meshes"] = coincident_poses(workload.size)
     for value in PRECISION_FRACTIONS:
         for group, poses in groups.items():
-            queries = {p: make_query(scenes[value], poses, "faces", precision=p) for p in PRECISIONS}
+            queries = {p: scenes[value].query(poses, "faces", precision=p) for p in PRECISIONS}
             found = {precision: query.run() for precision, query in queries.items()}  # grows where there is no room
             for result in found.values():
                 result.check()
@@ -60,33 +47,15 @@ def precision_rows(context, workload, scenes):
                 yield row | {"cost": times[precision] / times["exact"]}
 
 
-def output_rows(context, workload, scenes):
-    """Yield one row a fraction of faces and output: time and tests of one pose."""
-    poses, finest = workload.timed_poses(), None
-    for value in sorted(context.size(FRACTIONS, PRECISION_FRACTIONS), reverse=True):
-        scene = scenes[value]
-        queries = {output: make_query(scene, poses, output) for output in OUTPUTS}
-        found = {output: query.run() for output, query in queries.items()}
-        if not all(np.array_equal(result.any, found["any"].any) for result in found.values()):
-            raise RuntimeError("outputs differ in which poses intersect")
-        times = context.time_launches({output: query.launch for output, query in queries.items()})
-        finest = finest or times
-        for output, result in found.items():
-            row = {"case": "output", "workload": workload.name, "value": value, "setting": output}
-            row |= {"us": 1e3 * times[output] / len(poses), "cost": times[output] / times["any"]}
-            row |= {"of_finest": times[output] / finest[output], "node_tests": float(result.node_tests.mean())}
-            yield row | {"triangle_tests": float(result.triangle_tests.mean())}
-
-
 def margin_rows(context, workload, scenes):
     """Yield one row a fraction of faces and margin: pairs not proved apart, taken as intersecting, beside the truth."""
     poses = workload.timed_poses()
     for value in context.size(MARGIN_FRACTIONS, MARGIN_FRACTIONS[1:2]):
         scene, bound = scenes[value], workload.bound(workload.lods(fraction=value))
-        queries = {factor: make_query(scene, poses, "any", within=factor * bound) for factor in FACTORS}
+        queries = {factor: scene.query(poses, "any", within=factor * bound) for factor in FACTORS}
         found = {factor: query.run() for factor, query in queries.items()}
         times = context.time_launches({factor: query.prove_apart for factor, query in queries.items()})
-        plain = make_query(scene, poses, "any")
+        plain = scene.query(poses, "any")
         plain.run()
         alone = context.time_launches({"any": plain.launch})["any"]
         for factor in FACTORS:
@@ -99,9 +68,9 @@ def margin_rows(context, workload, scenes):
 
 
 def run(context):
-    """Yield the rows of all three settings, workload by workload."""
+    """Yield the rows of both settings, workload by workload."""
     for workload in workloads(context):
-        values = {*PRECISION_FRACTIONS, *context.size(FRACTIONS + MARGIN_FRACTIONS, ())}
+        values = {*PRECISION_FRACTIONS, *context.size(MARGIN_FRACTIONS, ())}
         scenes = {value: workload.scene(workload.lods(fraction=value)) for value in values}
-        for rows in (precision_rows, output_rows, margin_rows):
-            yield from rows(context, workload, scenes)
+        yield from precision_rows(context, workload, scenes)
+        yield from margin_rows(context, workload, scenes)

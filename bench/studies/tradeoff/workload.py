@@ -98,33 +98,52 @@ class Workload:
         low, _ = find_first_contact(intersects, self.motions, self.steps)
         return (low - self.low) / self.size
 
+    def repeated(self, poses, least=POSES_AT_A_TIME):
+        """Return poses, on CUDA several times over, at least so many: work for the device."""
+        return np.tile(poses, (-(-least // len(poses)) if self.device.is_cuda else 1, 1))
+
     def timed_poses(self, least=POSES_AT_A_TIME):
-        """Return poses to time: all of them, on CUDA several times over, at least so many: work for the device."""
-        times = -(-least // len(self.poses)) if self.device.is_cuda else 1
-        return np.tile(self.poses, (times, 1))
+        """Return poses to time."""
+        return self.repeated(self.poses, least)
+
+
+def time_rows(context, rows, launches, count, on_core=False):
+    """Add the time of one of so many poses [us] to rows by setting, whose launches are taken in turn."""
+    for key, milliseconds in context.time_launches(launches, on_core=on_core).items():
+        rows[key] |= {"us": 1e3 * milliseconds / count}
+
+
+def relate(rows, whole) -> list:
+    """Return rows by (method, setting) with both, and their costs relative to one of them."""
+    return [
+        row | {"method": method, "setting": setting, "cost": row["us"] / rows[whole]["us"]}
+        for (method, setting), row in rows.items()
+    ]
 
 
 def judge_answers(found, truth):
     """Return columns of yes-or-no answers beside the truth: counts, precision and recall (None of nothing)."""
-    hits, invented, missed = (int(x.sum()) for x in (found & truth, found & ~truth, ~found & truth))
-    row = {"poses": len(truth), "meet": int(truth.sum()), "missed": missed, "invented": invented}
-    row["precision"] = hits / (hits + invented) if hits + invented else None
-    return row | {"recall": hits / (hits + missed) if hits + missed else None}
+    meet, missed, invented = (int(x.sum()) for x in (truth, ~found & truth, found & ~truth))
+    return (
+        {"poses": len(truth)} | {"meet": meet, "missed": missed, "invented": invented} | rates(meet, missed, invented)
+    )
+
+
+def rates(meet, missed, invented):
+    """Return precision and recall, None of nothing."""
+    hits = meet - missed
+    return {"precision": hits / (hits + invented) if hits + invented else None, "recall": hits / meet if meet else None}
 
 
 def judge_contact(error):
     """Return columns of errors of the first contact [sizes]: mean and largest size, and the largest of either sign."""
     known = error[~np.isnan(error)]
-    columns = {
-        "contact_mean": lambda: np.abs(known).mean(),
-        "contact_max": lambda: np.abs(known).max(),
-        "early_max": lambda: max(0.0, known.max()),
-        "late_max": lambda: max(0.0, -known.min()),
-        "early": lambda: (known > 0).mean(),
-        "late": lambda: (known < 0).mean(),
-    }
-    row = {name: float(column()) if len(known) else None for name, column in columns.items()}
-    return {"never": int(np.isnan(error).sum())} | row
+    row = {"never": len(error) - len(known)}
+    if not len(known):
+        return row | dict.fromkeys(("contact_mean", "contact_max", "early_max", "late_max", "early", "late"))
+    row |= {"contact_mean": np.abs(known).mean(), "contact_max": np.abs(known).max()}
+    row |= {"early_max": max(0.0, known.max()), "late_max": max(0.0, -known.min())}
+    return row | {"early": (known > 0).mean(), "late": (known < 0).mean()}
 
 
 def find_front(costs, errors):
