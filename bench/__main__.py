@@ -33,14 +33,12 @@ FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figur
 # A case, and a study, takes the options that its function `run` has as arguments.
 OPTIONS = {
     "quick": {"action": "store_true", "default": None, "help": "the smallest sizes, to try a case out"},
-    "largest": {"type": int, "metavar": "FACES", "help": "leave larger meshes out"},
     "models": {"metavar": "DIR", "help": "keep the models there"},
     "plots": {"metavar": "DIR", "help": "draw figures there"},
     "count": {"type": int, "help": "random pairs, and a tenth as many adversarial ones; configurations; or worlds"},
     "out": {"required": True, "metavar": "DIR", "help": "where to write JSON, tables and figures"},
     "only": {"nargs": "+", "metavar": "PART", "help": "run these parts, or cases, alone; others are kept from before"},
     "before": {"metavar": "TREE", "help": "the other checkout"},
-    "processes": {"type": int, "help": "processes that run the oracle"},
 }
 
 

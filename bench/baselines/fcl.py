@@ -53,26 +53,24 @@ class Fcl:
         transforms = [self.fcl.Transform(matrix[:3, :3], matrix[:3, 3]) for matrix in matrices]
         self.b = [self.fcl.CollisionObject(self.shape_b, transform) for transform in transforms]
 
-    def _collide(self, request):
+    def _collide(self, request, poses):
         answers = []
-        for b in self.b:
+        for b in self.b[poses]:
             result = self.fcl.CollisionResult()
             self.fcl.collide(self.a, b, request, result)
             answers.append(result)
         return answers
 
-    def any(self):
-        return [result.is_collision for result in self._collide(self.yes_no)]
+    def any(self, poses=slice(None)):
+        return [result.is_collision for result in self._collide(self.yes_no, poses)]
 
-    def faces(self):
-        return self._collide(self.all)
+    def faces(self, poses=slice(None)):
+        return self._collide(self.all, poses)
 
     def distances(self, poses=slice(None)):
         """Return the distance at each of some poses, negative or 0 where A and B intersect."""
-        request, answers = self.fcl.DistanceRequest(), []
-        for b in self.b[poses]:
-            answers.append(self.fcl.distance(self.a, b, request, self.fcl.DistanceResult()))
-        return np.array(answers)
+        ask, request = self.fcl.distance, self.fcl.DistanceRequest()
+        return np.array([ask(self.a, b, request, self.fcl.DistanceResult()) for b in self.b[poses]])
 
     def first_contacts(self, ends, tolerance=1e-4):
         """Return when A, at rest, and B first touch on B's way to each of some matrices (n, 4, 4), 1 if never.
@@ -80,19 +78,11 @@ class Fcl:
         By conservative advancement, the origin on a straight line, constant angular velocity.
         """
         fcl, still, answers = self.fcl, self.fcl.Transform(), []
+        request = fcl.ContinuousCollisionRequest(toc_err=tolerance, ccd_motion_type=1, ccd_solver_type=1)
         for b, end in zip(self.b, ends, strict=True):
-            request = fcl.ContinuousCollisionRequest(toc_err=tolerance, ccd_motion_type=1, ccd_solver_type=1)
-            result = fcl.ContinuousCollisionResult()
-            answers.append(
-                fcl.continuousCollide(self.a, still, b, fcl.Transform(end[:3, :3], end[:3, 3]), request, result)
-            )
+            end, result = fcl.Transform(end[:3, :3], end[:3, 3]), fcl.ContinuousCollisionResult()
+            answers.append(fcl.continuousCollide(self.a, still, b, end, request, result))
         return np.array(answers)
-
-    def ask_one(self, pose, output):
-        """Return the answer at one pose."""
-        result = self.fcl.CollisionResult()
-        self.fcl.collide(self.a, self.b[pose], self.yes_no if output == "any" else self.all, result)
-        return result
 
     @staticmethod
     def face_pairs(answer):

@@ -18,7 +18,28 @@ CANDIDATES_PER_HIT = 4
 
 
 class Pipeline:
-    """A `newton.CollisionPipeline` with its state and contacts, in the attributes of these names."""
+    """A `newton.CollisionPipeline` over pairs of shapes that follow one another, with its state and contacts.
+
+    Args:
+        contacts, candidates: How many it has room for, of the latter a million at least.
+        options: More of the pipeline's.
+
+    Raises:
+        ImportError: Newton is not installed.
+    """
+
+    def __init__(self, model, contacts, candidates, **options):
+        import newton
+
+        self.model, self.state = model, model.state()
+        pairs = np.arange(model.shape_count).reshape(-1, 2)
+        options |= {"broad_phase": "explicit", "verify_buffers": False}
+        options["shape_pairs_filtered"] = wp.array(pairs, dtype=wp.vec2i, device=model.device)
+        room = {"rigid_contact_max": contacts, "max_triangle_pairs": max(1_000_000, candidates)}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large buffers
+            self.pipeline = newton.CollisionPipeline(model, **room, **options)
+            self.contacts = self.pipeline.contacts()
 
     def place(self, poses):
         """Move all bodies, float32 (n, 7)."""
@@ -41,6 +62,13 @@ class Pipeline:
                 raise RuntimeError(f"Newton lost {count} {what}")
 
 
+def finalize(builder, device):
+    """Return the model of a `newton.ModelBuilder`."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of inertia
+        return builder.finalize(device=device)
+
+
 class Newton(Pipeline):
     """Newton's pipeline over given pairs of one mesh.
 
@@ -48,9 +76,6 @@ class Newton(Pipeline):
         poses: Float32 (2 p, 7), the two objects of a pair one after the other.
         hits: About how many face pairs intersect, for the size of its buffers.
         sdf: Voxels along the longest side of a signed distance field, 0 for the BVH.
-
-    Raises:
-        ImportError: Newton is not installed.
     """
 
     def __init__(self, vertices, faces, poses, hits, device, sdf=0):
@@ -64,21 +89,8 @@ class Newton(Pipeline):
         config = newton.ModelBuilder.ShapeConfig(density=0.0, margin=0.0, gap=0.0)
         for pose in poses.tolist():
             builder.add_shape_mesh(builder.add_body(xform=wp.transform(*pose), mass=1.0), mesh=mesh, cfg=config)
-        pairs = wp.array(np.arange(2 * self.pair_count).reshape(-1, 2), dtype=wp.vec2i, device=device)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of inertia, and of large buffers
-            self.model = builder.finalize(device=device)
-            self.pipeline = newton.CollisionPipeline(
-                self.model,
-                broad_phase="explicit",
-                shape_pairs_filtered=pairs,
-                rigid_contact_max=CONTACTS_PER_PAIR * self.pair_count,
-                max_triangle_pairs=max(1_000_000, CANDIDATES_PER_HIT * hits),
-                contact_reduction_hashtable_size_factor=1.0,
-                verify_buffers=False,
-            )
-            self.state = self.model.state()
-            self.contacts = self.pipeline.contacts()
+        room = CONTACTS_PER_PAIR * self.pair_count, CANDIDATES_PER_HIT * int(hits)
+        super().__init__(finalize(builder, device), *room, contact_reduction_hashtable_size_factor=1.0)
 
     def result(self):
         """Return whether each pair has a contact, bool (p,), and the number of contacts.
@@ -96,8 +108,7 @@ class Newton(Pipeline):
     def compare(self, any_hit):
         """Return columns: contacts kept, pairs that it misses and invents beside the exact answer, bool (p,)."""
         found, count = self.result()
-        missed, invented = int((any_hit & ~found).sum()), int((found & ~any_hit).sum())
-        return {"contacts": count, "any_missed": missed, "any_invented": invented}
+        return {"contacts": count, "any_missed": (any_hit & ~found).sum(), "any_invented": (found & ~any_hit).sum()}
 
 
 def make_newton(vertices, faces, poses, hits, device):

@@ -6,7 +6,6 @@ do. Fields need CUDA; on the CPU its BVH takes their place. The bolt is a body a
 """
 
 import time
-import warnings
 from functools import partial
 
 import numpy as np
@@ -16,7 +15,7 @@ import warp_abtree as ab
 
 from ..memory import used_memory
 from ..timing import medians, time_in_turn
-from .newton import Pipeline
+from .newton import Pipeline, finalize
 
 RESOLUTION, BAND = 512, 0.005
 GAP, EXAMPLE_GAP = 5e-5, 0.005  # [m] a shape
@@ -26,7 +25,7 @@ POINTS = 32
 # `collide` makes, is twice the memory and nearly twice the time.
 OURS = {"ours": (None, 62_000), "ours_10um": (1e-5, 20_000), "ours_30um": (3e-5, 9_000)}
 FIELDS = tuple(f"rigid_contact_{name}" for name in ("shape0", "shape1", "point0", "point1", "normal"))
-ROOM_TRIES = 4
+ROOM_TRIES = 4  # each with four times the room
 
 
 def cook_meshes(models, device):
@@ -57,38 +56,20 @@ def make_model(meshes, worlds, device):
     for mesh in meshes:
         world.add_shape_mesh(world.add_body(), mesh=mesh, cfg=config)
     builder.replicate(world, worlds)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of inertia
-        return builder.finalize(device=device)
+    return finalize(builder, device)
 
 
 class NutFields(Pipeline):
     """Newton's pipeline over given pairs of a bolt and a nut, with room for what it finds."""
 
     def __init__(self, model, gap, poses):
-        import newton
-
-        self.model, self.gap, worlds = model, gap, model.shape_count // 2
-        pairs = wp.array(np.arange(2 * worlds).reshape(-1, 2), dtype=wp.vec2i, device=model.device)
-        self.state, room = model.state(), max(1_000_000, 2000 * worlds)
+        self.gap, worlds = gap, model.shape_count // 2
         for k in range(ROOM_TRIES):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of large buffers
-                self.pipeline = newton.CollisionPipeline(
-                    model,
-                    reduce_contacts=True,
-                    broad_phase="explicit",
-                    shape_pairs_filtered=pairs,
-                    rigid_contact_max=CONTACTS_PER_WORLD * worlds,
-                    max_triangle_pairs=room << 2 * k,
-                    verify_buffers=False,
-                )
-                self.contacts = self.pipeline.contacts()
+            super().__init__(model, CONTACTS_PER_WORLD * worlds, 2000 * worlds << 2 * k, reduce_contacts=True)
             self.place(poses)
             self.launch()
             try:
-                self.check()
-                break
+                return self.check()
             except RuntimeError:
                 if k == ROOM_TRIES - 1:
                     raise
@@ -113,8 +94,7 @@ class Ours:
         self.place(poses)
         self.found.collide(self.state, self.contacts)
 
-    def place(self, poses):
-        self.state.body_q.assign(poses)
+    place = Pipeline.place
 
     def launch(self):
         self.found.launch(self.state, self.contacts)

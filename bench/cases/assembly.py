@@ -8,7 +8,7 @@ installed; `--only hammered`, nuts under blows.
 """
 
 import importlib.util
-import time
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -20,7 +20,7 @@ from ..baselines.fcl import Fcl
 from ..meshes import ModelFolder
 from ..motions import hammered
 from ..shapes import centre_and_radius, scene_of_poses
-from ..timing import medians, no_garbage_collection, one_core, ratio_of, time_in_turn
+from ..timing import medians, one_core, ratio_of, time_on_host, to_host
 
 FULL, QUICK = (
     {"poses": 64, "worlds": 2048, "nuts": 1000, "repeats": 5},
@@ -162,22 +162,15 @@ def measure(name, models, matrices, device, repeats):
         row["fcl_differs"] = (np.array(fcl.any(), bool) != found["any"].any).sum()
     except ImportError as error:
         row["fcl_skipped"] = str(error)
-    middle = len(pairs) // 2
-    clock = time.thread_time if device.is_cpu else time.perf_counter
+    middle = slice(len(pairs) // 2, len(pairs) // 2 + 1)
     for output in OUTPUTS:
-        one = ab.Query(scene, output, pairs=pairs[middle : middle + 1])
-        launches = {"ours": run_to_host(queries[output]), "one": run_to_host(one)}
+        one = ab.Query(scene, output, pairs=pairs[middle])
+        launches = {"ours": to_host(queries[output]), "one": to_host(one)}
         if fcl:
-            launches |= {"fcl": getattr(fcl, output), "fcl_one": lambda output=output: fcl.ask_one(middle, output)}
-        with no_garbage_collection():
-            times = time_in_turn(launches, wp.get_device("cpu"), repeats, clock)
+            launches |= {"fcl": getattr(fcl, output), "fcl_one": partial(getattr(fcl, output), middle)}
+        times = time_on_host(launches, device, repeats)
         taken = medians(times)
         row |= {f"{output}_ms": taken["ours"] / len(pairs), f"{output}_one_ms": taken["one"]}
         for key, base in {"fcl": "ours", "fcl_one": "one"}.items() if fcl else ():
             row[f"{output}_{key}_ratio"] = ratio_of(times[key], times[base])
     return row
-
-
-def run_to_host(query):
-    """Return a callable that launches a query and returns its result."""
-    return lambda: (query.launch(), query.result())[1]

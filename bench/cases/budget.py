@@ -4,7 +4,7 @@ T is measured first: the median frame at the finest LODs, after the first second
 the CPU time of its thread, so that what else the machine does is left out.
 
 Then what control costs: a budget that the finest LODs keep makes the controller stay there, so that its frames have all
-of its cost and none of its gain; and selection of many LODs alone.
+of its cost and none of its gain.
 """
 
 import contextlib
@@ -14,7 +14,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import trimesh
 import warp as wp
 
 import warp_abtree as ab
@@ -23,7 +22,7 @@ from warp_abtree.lod.timing import STAGES
 from warp_abtree.simulate.budget_report import budget_report
 
 from .. import tables
-from ..timing import medians, one_core, summarise, time_in_turn
+from ..timing import medians, one_core, summarise
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 NAMES = ("rain", "focus")
@@ -36,7 +35,6 @@ BREACH = 3.5  # how often the finest LODs take the budget
 CONTROLLED = ("focus", "herd", "rain", "worlds")
 CONTROLLED_OBJECTS = {"cpu": 200, "cuda": None}
 BUDGETS = (2.0, 0.5)
-SELECTED = (1_500, 100_000)  # objects whose LODs are selected
 CONTROLLERS = ("none", "coarsest", "predictive", "paper", "tolerance")
 
 
@@ -72,8 +70,6 @@ def run(device, quick=False, plots=None):
             continue  # its meshes need usd-core
         objects = QUICK_OBJECTS if quick else CONTROLLED_OBJECTS[kind]
         yield from compare(read_scene(name, device, objects), name, frames)
-    for count in SELECTED[: 1 if quick else 2]:
-        yield from time_selection(device, count)
 
 
 def read_scene(name, device, objects):
@@ -152,25 +148,3 @@ def run_frames(loaded, frames, budget):
     frame.warm_up()
     collect()
     return frame.run(frames)[frames // 2 :]
-
-
-def time_selection(device, count):
-    """Yield a row a controller that selects LODs of so many objects."""
-    sections = (48, 44, 40)
-    models = [ab.Model.load(trimesh.creation.torus(0.5, 0.2, major_sections=n, minor_sections=24)) for n in sections]
-    scene, poses, turn = ab.Scene(device), np.zeros((count, 7)), np.arange(count) % 3
-    poses[:, :3], poses[:, 6] = np.random.default_rng(0).uniform(-20, 20, (count, 3)), 1
-    scene.add_many([models[k] for k in turn], poses, importances=1 + turn)
-    camera = ab.Camera.look_at((0, 0, 30), (0, 0, 0))
-    made = {
-        "predictive": ab.PredictiveController(scene, 10.0, camera),
-        "paper": ab.PaperController(scene, 10.0, camera),
-        "tolerance": ab.ToleranceController(scene, 0.01, camera),
-    }
-    for controller in made.values():
-        controller.prepare(ab.Feedback(0.0))
-    made["predictive"].tests.fill_(1000)
-    made["predictive"].rate.assign([1.0, 1e-7, 1e-6, 1.0, 0.5])
-    times = medians(time_in_turn({name: controller.launch for name, controller in made.items()}, device))
-    for name, taken in times.items():
-        yield {"controller": name, "device": device.name, "objects": count, "select_ms": taken}

@@ -33,7 +33,7 @@ ORDERS = list(itertools.product(itertools.permutations(range(3)), itertools.perm
 STAGES = ("float32_stage_ns", "float64_stage_ns", "exact_stage_ns", "float32_ns")
 
 
-def run(device, count=None, processes=2, quick=False):
+def run(device, count=None, quick=False):
     """Yield one row a kind of pair: pairs asked, fraction that intersect (meet), disagreements of any stage with the
     truth, fractions left to float64 and to exact signs, error rate of float32 alone, time a pair [ns]; then one a
     scene of meshes.
@@ -49,7 +49,7 @@ def run(device, count=None, processes=2, quick=False):
     for mode in (FILTER, EXACT, FLOAT32):
         ask(mode, one, device)
     jobs, wrong = list_jobs(count or (QUICK_COUNT if quick else COUNT)), 0
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+    with multiprocessing.get_context("spawn").Pool(1 if quick else None) as pool:
         chunks = zip(jobs, pool.imap(find_truth, jobs), strict=True)
         for kind, group in itertools.groupby(chunks, key=lambda chunk: chunk[0][0]):
             tally = sum(check_chunk(job, truth, device) for job, truth in group)

@@ -90,33 +90,22 @@ class PoseScene:
     def __init__(self, device, models, lods, far, room):
         self.scene, self.pairs = scene_of_poses(device, *models, np.tile(far, (room, 1)))
         self.scene.set_lods([lods[0]] + [lods[1]] * room)
-        self.room, self._far, self._queries = room, far, {}
+        self.room, self._far, self._any = room, far, ab.Query(self.scene, "any", pairs=self.pairs)
 
     def place(self, poses):
         """Pose the first Bs, and put the others away."""
         still, rest = [(0, 0, 0, 0, 0, 0, 1)], np.tile(self._far, (self.room - len(poses), 1))
         self.scene.set_poses(np.concatenate([still, poses, rest]))
 
-    def _ask(self, poses, column, within=None):
-        """Return a column of the results at poses, so many at a time, with distances (n,) or without."""
-        if (within is None) not in self._queries:
-            options = {} if within is None else {"within": 0.0}
-            self._queries[within is None] = ab.Query(self.scene, "any", pairs=self.pairs, **options)
-        query, found = self._queries[within is None], np.zeros(len(poses), bool)
-        for start in range(0, len(poses), self.room):
-            part = slice(start, min(start + self.room, len(poses)))
-            self.place(poses[part])
-            query.set_pairs(self.pairs[: part.stop - start], **({} if within is None else {"within": within[part]}))
-            found[part] = getattr(query.run(), column)
-        return found
-
     def intersects(self, poses):
         """Return whether A and B intersect at each pose."""
-        return self._ask(poses, "any")
-
-    def near(self, poses, within):
-        """Return whether A and B are not proved farther apart than a distance, at each pose."""
-        return ~self._ask(poses, "apart", np.broadcast_to(np.asarray(within, float), len(poses)))
+        found = np.zeros(len(poses), bool)
+        for start in range(0, len(poses), self.room):
+            part = poses[start : start + self.room]
+            self.place(part)
+            self._any.set_pairs(self.pairs[: len(part)])
+            found[start : start + len(part)] = self._any.run().any
+        return found
 
     def query(self, poses, output, **options):
         """Return a query of poses, which are placed; its first run makes room for what it finds."""

@@ -43,7 +43,7 @@ def check_query(rows):
 
 
 def check_update(rows):
-    assert [row["faces"] for row in pick(rows, case="crossover")] == [168, 576]
+    assert {row["faces"] for row in pick(rows, case="one state")} == {168, 576}
     for row in pick(rows, case="one state"):
         assert row["k"] <= row["nodes_refitted"] <= row["bound"] and row["entries"] >= row["k"]
         share = testing.current_regime().full_refit["cpu" if row["device"] == "CPU" else "cuda"]
@@ -118,8 +118,7 @@ def check_motion(rows):
 
 
 def check_build(rows):
-    *rows, slopes = rows
-    assert [row["faces"] for row in rows] == [168, 576] and slopes["build_ms_slope"] is not None
+    assert [row["faces"] for row in rows] == [168, 576]
     for row in rows:
         stages = sum(row[f"{name}_ms"] for name in ("collapse", "error", "tree"))
         assert stages == pytest.approx(row["build_ms"], rel=0.5) and row["error_ms"] > 0
@@ -142,7 +141,7 @@ def check_budget(rows):
     assert {row["scene"] for row in controlled} >= {"focus", "rain", "worlds"}
     for row in controlled:
         assert row["ratio"] == pytest.approx(row["total_ms"] / row["finest_ms"], rel=0.01) and row["select_ms"] > 0
-    assert [row["controller"] for row in rows if row not in held + controlled] == ["predictive", "paper", "tolerance"]
+    assert len(rows) == len(held) + len(controlled)
     for row in held:
         assert row["judged"] == 3 and 0 <= row["within"] <= row["within_110_percent"] <= 1 and row["budget_ms"] > 0
         assert (row["error_max"] == 0) == (row["controller"] == "none") and row["cost_ms"] <= row["cost_p95_ms"]
@@ -171,7 +170,6 @@ def test_case(name, device, tmp_path, monkeypatch, capsys):
     for library in {"baselines": ["fcl"], "robot": ["fcl", "yourdfpy"]}.get(name, []):
         pytest.importorskip(library)
     file, more = tmp_path / "rows.json", ["--plots", str(tmp_path)] if name in PLOTS else []
-    more += ["--processes", "1"] if name == "exact" else []
     assert main.main([name, "--device", device, "--quick", "--json", str(file), *more]) == 0
     written = json.loads(file.read_text())
     assert written["warp"] == wp.config.version and f"{[*written['rows'][-1]][-1]}=" in capsys.readouterr().out
@@ -188,7 +186,6 @@ def test_case(name, device, tmp_path, monkeypatch, capsys):
         assert all((tmp_path / picture).stat().st_size > 10_000 for picture in PLOTS[name])
 
 
-def test_large_meshes_are_left_out_and_models_kept(device, tmp_path, capsys):
-    words = ["update", "--device", device, "--quick", "--largest", "300", "--models", str(tmp_path)]
-    assert main.main(words) == 0 and "faces=576" not in capsys.readouterr().out
-    assert [path.name for path in tmp_path.iterdir()] == ["knot-200-base10.npz"]
+def test_models_are_kept(device, tmp_path):
+    assert main.main(["update", "--device", device, "--quick", "--models", str(tmp_path)]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"knot-200-base10.npz", "knot-600-base10.npz"}

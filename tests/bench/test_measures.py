@@ -8,7 +8,7 @@ import trimesh
 
 import warp_abtree as ab
 from bench import timing
-from bench.cases.update import bound_nodes, find_crossover
+from bench.cases.update import bound_nodes
 from bench.studies.motions import Motions, PoseScene, find_first_contact
 from bench.studies.paper import update
 from bench.studies.tradeoff import regions, summaries, workload
@@ -19,9 +19,9 @@ pytestmark = pytest.mark.slow
 
 def test_slope_and_crossover():
     assert timing.fit_slope([1, 10, 100], [2.0, 20.0, 200.0]) == 1 and timing.fit_slope([3], [1.0]) is None
-    rows = [{"k": k, "update_ms": k / 100, "full_ms": 1.0} for k in (1, 10, 80, 125, 1000)]
-    found = [find_crossover(some, "k") for some in (rows, rows[:3], rows[3:])]
-    assert found == [pytest.approx(100), None, 125] and timing.crossover([0.1, 1.0], [1.0, 2.0], 0.0) == 0.0
+    x, excess = np.array([1, 10, 80, 125, 1000]), np.log(np.array([1, 10, 80, 125, 1000]) / 100)
+    found = [timing.crossover(x[some], excess[some], 0.0) for some in (slice(5), slice(3), slice(3, 5))]
+    assert found == [pytest.approx(100), None, 0.0]
 
 
 def test_fit_of_figure_6():
@@ -52,9 +52,6 @@ def test_first_contact_of_boxes(device, offset):
     low, high = find_first_contact(scene.intersects, motions, steps=50)
     assert low == pytest.approx([1, 1, 1], abs=1e-9) and (high >= low).all()
     assert scene.intersects(motions.poses(low)).all() and not scene.intersects(motions.poses(high)).any()
-    poses = motions.poses([1.25, 1.25, 1.25])
-    assert scene.near(poses, 0.3).tolist() == [True] * 3 and scene.near(poses, 0.2).tolist() == [False] * 3
-    assert scene.near(poses, [0.3, 0.2, 0.3]).tolist() == [True, False, True]
     low, high = find_first_contact(lambda poses: poses[:, 0] + offset > 0.4, motions, steps=16)
     assert not np.isnan(low[0]) and np.isnan(low[1:]).all() and np.isnan(high[1:]).all()
     assert workload.judge_contact(low - 1)["never"] == 2

@@ -12,7 +12,7 @@ from bench import tables
 from bench.shapes import knot
 from bench.studies import study
 from bench.studies.paper import meshes, static, update
-from bench.studies.tradeoff import competitors, distances, lods, motions, settings
+from bench.studies.tradeoff import competitors, distances, lods, motions
 from bench.tables import pick
 
 pytestmark = pytest.mark.slow
@@ -70,7 +70,6 @@ def check_tradeoff(parts, model):
     assert coarse["share"] == pytest.approx(0.1, abs=0.02) and coarse["node_tests"] < finest["node_tests"]
     assert all(0 < row["bound"] <= row["value"] for row in pick(levels, kind="tolerance"))
     assert sum(row["missed"] for row in pick(parts["lods"], case="offset", value=0.1)) == coarse["missed"]
-    check_settings(parts["settings"])
     rows = parts["competitors"]
     ours, theirs = (pick(rows, method=name) for name in (competitors.OURS, competitors.OURS_FCL))
     assert len(ours) == len(theirs) == 4
@@ -105,19 +104,6 @@ def check_motions(rows):
         assert row["early_max"] <= tolerance + motions.LEAST and row["late_max"] <= motions.LEAST
         assert row["missed"] == row["invented"] == row["undecided"] == 0 < row["meet"]
     assert levels[0]["time_mean"] > levels[2]["time_mean"] > 1e-6 >= levels[-1]["early_max"]
-
-
-def check_settings(rows):
-    for row in pick(rows, case="precision", setting="exact"):
-        assert row["missed"] == row["invented"] == row["faces_missed"] == row["faces_invented"] == 0
-    (laid,) = pick(rows, case="precision", setting="float32", poses_kind="coincident meshes", value=1)
-    assert laid["faces_missed"] > 0 and laid["faces_invented"] > 0
-    (touching,) = pick(rows, case="precision", setting="exact", poses_kind="at first contact", value=1)
-    assert touching["meet"] == touching["poses"] / 2, "one side of each first contact meets, exactly"
-    margins = pick(rows, case="margin", value=0.1)
-    assert [row["factor"] for row in margins] == list(settings.FACTORS)
-    assert margins[0]["recall"] < 1 and all(row["recall"] == 1 and not row["late_max"] for row in margins[3:])
-    assert [row["invented"] for row in margins] == sorted(row["invented"] for row in margins)
 
 
 @pytest.mark.parametrize("name", [name for name, module in main.STUDIES.items() if module == "study"])

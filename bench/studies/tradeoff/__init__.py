@@ -2,11 +2,10 @@
 
 from functools import partial
 
-from . import competitors, distances, lods, motions, settings, summaries
+from . import competitors, distances, lods, motions, summaries
 
 PARTS = {
     "lods": lods.run,
-    "settings": settings.run,
     "competitors": competitors.run,
     "distances": distances.run,
     "motions": motions.run,
@@ -15,8 +14,6 @@ SUMMARIES = {
     "over_meshes": summaries.over_meshes,
     "choose": summaries.choose,
     "by_offset": summaries.by_offset,
-    "precisions": summaries.precisions,
-    "margins": partial(summaries.summarise, names=("value", "factor")),
     "over_workloads": summaries.over_workloads,
     "distances": partial(summaries.summarise, names=("method", "setting", "where")),
     "motions": partial(summaries.summarise, names=("method", "setting")),

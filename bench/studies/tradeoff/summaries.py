@@ -5,7 +5,7 @@ import numpy as np
 from ...tables import pick
 from .workload import rates
 
-SUMMED = ("poses", "meet", "missed", "invented", "undecided", "hits", "faces_missed", "faces_invented")
+SUMMED = ("poses", "meet", "missed", "invented", "undecided")
 LARGEST = ("early_max", "late_max", "contact_max", "region_hausdorff_max", "distance_max")
 RATIOS = ("us", "cost", "build_s", "any_cost", "contacts_cost")
 TESTS = ("node_tests", "contacts_node_tests")
@@ -109,12 +109,6 @@ def by_offset(rows):
             row[f"wrong {value}"] = wrong / sum(member["poses"] for member in at) if at else None
         found.append(row)
     return found
-
-
-def precisions(rows):
-    """Return one row a fraction of the faces, kind of poses and precision."""
-    found = summarise(rows, ("value", "poses_kind", "setting"))
-    return sorted(found, key=lambda row: (-row["value"], row["poses_kind"]))
 
 
 def over_workloads(rows):
