@@ -33,9 +33,9 @@ PANEL = (4.6, 3.9)  # inches
 
 
 def read_layout(name) -> dict:
-    """Return the tables and figures of a TOML file of this folder; a table's name is that of its part by default."""
+    """Return the tables and figures of a TOML file of this folder; a table's part is by default that of its name."""
     layout = tomllib.loads((HERE / name).read_text(encoding="utf-8"))
-    return layout | {"table": [{"name": table.get("part")} | table for table in layout.get("table", [])]}
+    return layout | {"table": [{"name": key, "part": key} | table for key, table in layout.get("table", {}).items()]}
 
 
 def pick(rows, **where) -> list:
@@ -79,17 +79,19 @@ def select_rows(layout, study):
     A layout's `rows` are texts, each with the values of one row of the study in it.
     """
     if "rows" in layout:
-        return [show_row(row, layout["columns"], study) for row in layout["rows"]]
+        return [row for part in layout["rows"] for row in show_rows(part, layout["columns"], study)]
     rows = pick(study["parts"].get(layout["part"], {"rows": []})["rows"], **layout.get("where", {}))
     if rows and "select" in layout:
         rows = importlib.import_module(f"bench.studies.{study['study']}").SUMMARIES[layout["select"]](rows)
     return rows
 
 
-def show_row(layout, columns, study) -> dict:
-    """Return the texts of a row, its values filled in."""
+def show_rows(layout, columns, study) -> list:
+    """Return rows of texts, the values of one row of the study filled in."""
     (row,) = pick(study["parts"][layout["part"]]["rows"], **layout["where"])
-    return {name: text.format(**row) for (name, _), text in zip(columns, layout["show"], strict=True)}
+    return [
+        {name: text.format(**row) for (name, _), text in zip(columns, texts, strict=True)} for texts in layout["show"]
+    ]
 
 
 def markdown_table(layout, study, short=None) -> str:
@@ -134,7 +136,7 @@ def study_page(study) -> str:
     title = layout.get("title", f"Study {study['study']}: {', '.join(devices) or 'nothing'}")
     blocks = [f"# {title}", markdown_run(study)]
     for table in layout["table"]:
-        if table.get("part") in study["parts"]:
+        if table["part"] in study["parts"]:
             blocks += [f"## {table['title']}"] + [ran[table["part"]]] * (len(set(ran.values())) > 1)
             blocks += [markdown_table(table, study)] + ([table["note"]] if "note" in table else [])
     blocks += [note for part in study["parts"].values() for note in part["notes"]]
@@ -144,10 +146,7 @@ def study_page(study) -> str:
 def fill_page(text, name, study) -> str:
     """Return the text of a page with the tables of a file of rows in their places, each with its device and command.
 
-    Of a layout that has `short` only that is shown.
-
-    Raises:
-        ValueError: The layout has no such table.
+    Of a layout that has `short` only that is shown; a table that has none is a ValueError.
     """
     layouts = {table["name"]: table for table in read_layout(f"studies/{study['study']}.toml")["table"]}
 
@@ -157,7 +156,7 @@ def fill_page(text, name, study) -> str:
         if place["table"] not in layouts:
             raise ValueError(f"no table {place['table']} in bench/studies/{study['study']}.toml")
         layout, said = layouts[place["table"]], ""
-        if "part" in layout:
+        if layout["part"] in study["parts"]:
             said = f"\n{say_run(study['parts'][layout['part']]['run'])} "
         return f"{place[1]}{markdown_table(layout, study, layout.get('short'))}\n{said}{place[4]}"
 

@@ -23,9 +23,6 @@ class Pipeline:
     Args:
         contacts, candidates: How many it has room for, of the latter a million at least.
         options: More of the pipeline's.
-
-    Raises:
-        ImportError: Newton is not installed.
     """
 
     def __init__(self, model, contacts, candidates, **options):
@@ -93,11 +90,8 @@ class Newton(Pipeline):
         super().__init__(finalize(builder, device), *room, contact_reduction_hashtable_size_factor=1.0)
 
     def result(self):
-        """Return whether each pair has a contact, bool (p,), and the number of contacts.
-
-        Raises:
-            RuntimeError: It lost something for lack of room, or has contacts between objects of different pairs.
-        """
+        """Return whether each pair has a contact, bool (p,), and their number; raise a RuntimeError where some are lost
+        for lack of room, or are between objects of different pairs."""
         self.check()
         count = int(self.contacts.rigid_contact_count.numpy()[0])
         first, second = (getattr(self.contacts, f"rigid_contact_shape{i}").numpy()[:count] // 2 for i in (0, 1))

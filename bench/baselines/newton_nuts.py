@@ -127,9 +127,6 @@ def measure(models, matrices, others, device, repeats):
     Args:
         models: Bolt and nut.
         matrices, others: Two sets of poses of the nuts in their bolts' frames, (worlds, 4, 4).
-
-    Raises:
-        RuntimeError: Nuts that meet their bolts and nuts whose contacts cross are not the same number.
     """
     before, (_, first) = taken_memory(device), cook_meshes(models, device)  # compiles
     meshes, seconds = cook_meshes(models, device)
@@ -182,7 +179,7 @@ def body_poses(matrices):
 
 
 def check_ours(name, ours) -> dict:
-    """Return columns: faces, nuts that meet their bolts, near face pairs; contacts are held against the second."""
+    """Return columns: faces, nuts that meet their bolts, near face pairs; raise where contacts differ from them."""
     found, scene = ours.found.query.result(with_points=False), ours.found.scene
     meet, crossing = scene.intersect(found.pairs, "any").any.sum(), found.any.sum()
     if meet != crossing:

@@ -15,6 +15,7 @@ from ..timing import medians, time_in_turn
 wp.set_module_options({"enable_backward": False})
 CONSTRUCTORS = ("sah", "median", "lbvh", "cubql")
 BLOCK_THREADS = 64
+TUNED = 64  # pairs that the constructor is chosen for
 MORTON_BITS = 10  # of each coordinate
 
 
@@ -82,10 +83,8 @@ def morton_order(points) -> np.ndarray:
     """Return the order of points (n, 3) along a Morton curve."""
     low, size = points.min(0), max(np.ptp(points, axis=0).max(), 1e-30)
     cell = ((points - low) / size * (2**MORTON_BITS - 1)).astype(np.int64)
-    code = np.zeros(len(points), np.int64)
-    for bit in range(MORTON_BITS):
-        for axis in range(3):
-            code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
+    bit, axis = np.meshgrid(np.arange(MORTON_BITS), np.arange(3))
+    code = ((cell[:, :, None] >> bit & 1) << (3 * bit + axis)).sum((1, 2))
     return np.argsort(code, kind="stable")
 
 
@@ -122,10 +121,12 @@ class BvhPosed(FaceBvh):
 
     Args:
         capacity: Face pairs that there is room for, None asks yes or no.
+        constructor: None takes the one that answers fastest.
     """
 
-    def __init__(self, vertices, faces, poses, capacity, device, constructor="sah"):
-        super().__init__(vertices, faces, device, constructor)
+    def __init__(self, vertices, faces, poses, capacity, device, constructor=None):
+        self.constructor = constructor or find_constructor(vertices, faces, poses[: 2 * TUNED], device)
+        super().__init__(vertices, faces, device, self.constructor)
         self.yes_no = capacity is None
         self.pair_count = len(poses) // 2
         self.asked.poses = wp.array(np.asarray(poses, np.float32), dtype=wp.transform, device=device)

@@ -22,10 +22,8 @@ from ..motions import hammered
 from ..shapes import centre_and_radius, scene_of_poses
 from ..timing import medians, one_core, ratio_of, time_on_host, to_host
 
-FULL, QUICK = (
-    {"poses": 64, "worlds": 2048, "nuts": 1000, "repeats": 5},
-    {"poses": 3, "worlds": 1, "nuts": 1, "repeats": 1},
-)
+FULL = {"poses": 64, "worlds": 2048, "nuts": 1000, "repeats": 5}
+QUICK = {"poses": 3, "worlds": 1, "nuts": 1, "repeats": 1}
 OUTPUTS = ("faces", "any")
 TURNS, PITCH = 5, 2.5e-3  # of a nut that starts at the first height, and of an M20 thread [m]
 NUT_HEIGHT, PEG_HEIGHT = 0.01, -0.01  # where heights are scanned from; where the peg stands [m]
@@ -143,11 +141,7 @@ CASES = (
 
 
 def measure(name, models, matrices, device, repeats):
-    """Return the row of one workload.
-
-    Raises:
-        RuntimeError: Outputs differ about what intersects.
-    """
+    """Return the row of one workload; raise a RuntimeError where outputs differ about what intersects."""
     meshes = [model.mesh_at(model.lod_max)[:2] for model in models]
     scene, pairs = scene_of_poses(device, *models, matrices)
     queries = {output: ab.Query(scene, output, pairs=pairs) for output in OUTPUTS}

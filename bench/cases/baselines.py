@@ -59,11 +59,7 @@ def half_in_contact(models, count):
 
 
 def measure(models, device, count, repeats):
-    """Yield one row a baseline of two models at poses.
-
-    Raises:
-        RuntimeError: Our outputs differ, or the exact oracle sides with a baseline.
-    """
+    """Yield one row a baseline; raise a RuntimeError where our outputs differ, or the oracle sides with a baseline."""
     a = models[0].mesh_at(models[0].lod_max)[:2]
     meshes = a, a if models[1] is models[0] else models[1].mesh_at(models[1].lod_max)[:2]
     matrices = half_in_contact(models, count)

@@ -36,10 +36,7 @@ STAGES = ("float32_stage_ns", "float64_stage_ns", "exact_stage_ns", "float32_ns"
 def run(device, count=None, quick=False):
     """Yield one row a kind of pair: pairs asked, fraction that intersect (meet), disagreements of any stage with the
     truth, fractions left to float64 and to exact signs, error rate of float32 alone, time a pair [ns]; then one a
-    scene of meshes.
-
-    Raises:
-        RuntimeError: An answer was wrong, or the tests' oracle is not at hand.
+    scene of meshes. Raise a RuntimeError where an answer was wrong, or the tests' oracle is not at hand.
     """
     device = wp.get_device(device)
     if load_oracle() is None:
@@ -108,11 +105,9 @@ def reorder_pairs(pairs):
     whole = np.repeat(rows[::WHOLE_EVERY], len(ORDERS))
     order = np.concatenate([rows % len(ORDERS), np.arange(len(whole)) % len(ORDERS)])
     rows = np.concatenate([rows, whole])
-    reordered = np.empty((len(rows), 2, 3, 3))
-    for k, (p, q, swap) in enumerate(ORDERS):
-        chosen = order == k
-        reordered[chosen, swap] = pairs[rows[chosen], 0][:, p]
-        reordered[chosen, 1 - swap] = pairs[rows[chosen], 1][:, q]
+    first, second, swap = (np.array(part)[order] for part in zip(*ORDERS))
+    reordered = np.stack([pairs[rows[:, None], 0, first], pairs[rows[:, None], 1, second]], 1)
+    reordered[swap == 1] = reordered[swap == 1, ::-1]
     return reordered, rows
 
 

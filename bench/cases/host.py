@@ -46,8 +46,13 @@ def time_output(device, scene, pairs, output, repeats):
     else:
         query = ab.Query(scene, output, pairs=pairs, capacity=capacity)
     compare(found, query.run(), scene.intersect(pairs, output, device=True))
+    kept = [found]
+
+    def intersect():
+        kept[0] = scene.intersect(pairs, output)
+
     runs = make_runs({"launches": query.launch}, device)
-    runs["intersect"] = time_call(Keeper(lambda: scene.intersect(pairs, output)), device)
+    runs["intersect"] = time_call(intersect, device)
     runs["result"] = time_call(query.result, device)
     runs["on_device"] = time_call(lambda: scene.intersect(pairs, output, device=True), device)
     times = medians(time_rounds(runs, repeats))
@@ -56,16 +61,6 @@ def time_output(device, scene, pairs, output, repeats):
     goal = times["launches"] + size / BYTES_PER_MS
     row = {"hits": capacity, "bytes": size} | {f"{name}_ms": value for name, value in times.items()}
     return row | {"goal_ms": goal, "ratio": round(times["intersect"] / goal, 2)}
-
-
-class Keeper:
-    """Calls something and keeps what it returned until the next call has returned, as a loop's variable does."""
-
-    def __init__(self, call):
-        self.call, self.kept = call, None
-
-    def __call__(self):
-        self.kept = self.call()
 
 
 def compare(found, again, on_device=None):

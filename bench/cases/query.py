@@ -9,9 +9,9 @@ import warp as wp
 import warp_abtree as ab
 
 from ..baselines.newton import make_newton
-from ..baselines.wp_bvh import BvhPosed, find_constructor
+from ..baselines.wp_bvh import BvhPosed
 from ..memory import memory_columns
-from ..shapes import FAR, KNOT_PAIRS, knot, knot_batches, pair_poses, scene_of_pairs
+from ..shapes import KNOT_PAIRS, knot, knot_batches, pair_poses, scene_of_pairs
 from ..timing import ratio_of, summarise, time_in_turn
 from ..verify import count_differences, judge_disputed
 
@@ -32,13 +32,12 @@ def run(device, quick=False):
     sizes = QUICK if quick else KNOT_PAIRS
     mesh = knot(sizes["faces"])
     model = ab.Model.from_arrays(*mesh, name=f"knot {len(mesh[1]):,}")
-    constructor = find_constructor(*mesh, pair_poses(min(64, max(sizes["pairs"])), FAR), device)
     for pair_count, distance in knot_batches(device, sizes):
         poses = pair_poses(pair_count, distance)
-        yield {"distance": distance} | run_batch(device, model, mesh, poses, constructor, sizes["repeats"])
+        yield {"distance": distance} | run_batch(device, model, mesh, poses, sizes["repeats"])
 
 
-def run_batch(device, model, mesh, poses, constructor, repeats):
+def run_batch(device, model, mesh, poses, repeats):
     """Return the row of one batch of pairs."""
     gc.collect()  # scenes and their queries hold each other
     scene, pairs = scene_of_pairs(device, model, poses)
@@ -47,10 +46,10 @@ def run_batch(device, model, mesh, poses, constructor, repeats):
     first = time.perf_counter() - begin
     query = ab.Query(scene, output="faces", pairs=pairs, capacity=max(1, len(whole.faces)))
     memory = memory_columns(scene, query)
-    baseline = BvhPosed(*mesh, poses, 4 * len(whole.faces) + 1024, device, constructor)
+    baseline = BvhPosed(*mesh, poses, 4 * len(whole.faces) + 1024, device)
     row = {"device": device.name, "faces": len(mesh[1]), "pairs": len(pairs), "hits": len(whole.faces)}
     row |= {name: getattr(whole, name).sum(dtype=np.int64) for name in COUNTERS}
-    row |= {"first_s": first, "peer": f"wp.Bvh {constructor}"}
+    row |= {"first_s": first, "peer": f"wp.Bvh {baseline.constructor}"}
     newton, skipped = {}, {"newton": "more pairs take minutes"}
     if len(pairs) <= NEWTON_PAIRS_MAX["cuda" if device.is_cuda else "cpu"]:
         newton, skipped = make_newton(*mesh, poses, len(whole.faces), device)

@@ -11,14 +11,14 @@ import warp as wp
 
 import warp_abtree as ab
 
-from ..baselines.wp_bvh import BvhPosed, find_constructor
+from ..baselines.wp_bvh import BvhPosed
 from ..memory import memory_columns, used_memory
 from ..meshes import real_meshes
 from ..shapes import knot, longest_side, random_poses, scene_of_poses
 from ..timing import ratio_of, summarise, time_call, time_in_turn, time_rounds
 
 FULL = {"faces": 5000, "counts": (1024, 65536), "sweep_counts": (1024, 65536, 2**21), "repeats": 11}
-CPU = {"faces": 5000, "counts": (1024, 16384), "sweep_counts": (1024, 65536), "repeats": 5}
+CPU = FULL | {"counts": (1024, 16384), "sweep_counts": (1024, 65536), "repeats": 5}
 QUICK = {"faces": 300, "counts": (16,), "sweep_counts": (16, 40), "repeats": 1}
 
 
@@ -50,8 +50,7 @@ def run_launch(device, model, poses, repeats):
     mesh = model.mesh_at(model.lod_max)[:2]
     both = np.zeros((2 * len(poses), 7), np.float32)
     both[::2, 6], both[1::2] = 1, poses
-    constructor = find_constructor(*mesh, both[: 2 * min(64, len(poses))], device)
-    baseline = BvhPosed(*mesh, both, None, device, constructor)
+    baseline = BvhPosed(*mesh, both, None, device)
     times = time_in_turn({"launch": query.launch, "peer": baseline.launch}, device, repeats)
     query.launch()
     if not np.array_equal(query.result().any, result.any):

@@ -53,10 +53,6 @@ class Questions:
         """Return a scene of a nut on its bolt, and the pair."""
         return scene_of_poses(self.device, *(ModelFolder(None).load([name]) for name in NUT), [NUT_POSE])
 
-    def ends(self, scene):
-        """Return end poses that bring the objects of a scene of pairs a size further."""
-        return random_poses(2.0, scene.object_count, seed=7)
-
 
 def fields_of(result):
     """Return the arrays of a result that were asked for."""
@@ -87,7 +83,7 @@ def ask_distances(ask):
 
 def ask_motions(ask):
     scene, pairs = ask.pairs(ask.few, 3.0)
-    ends = ask.ends(scene)
+    ends = random_poses(2.0, scene.object_count, seed=7)
     for options in ({}, {"screw": True}, {"linear": True}, {"tolerance": 1e-3}):
         yield str(options), fields_of(scene.first_contact(pairs, ends, **options))
 
@@ -148,7 +144,7 @@ def launch_distance(ask, fresh):
 
 def launch_motion(ask):
     scene, pairs = ask.pairs(ask.many, 3.0)
-    query = ab.FirstContactQuery(scene, ask.ends(scene), pairs)
+    query = ab.FirstContactQuery(scene, random_poses(2.0, scene.object_count, seed=7), pairs)
     query.run()
     return query.launch
 

@@ -7,6 +7,7 @@ our own. Around it stand real meshes, joined to one of about 190,000 faces; with
 import os
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -90,12 +91,24 @@ def run(device, quick=False, only=PARTS):
         if "any" in only:
             yield about | run_any(device, clock, robot, around, configurations, sizes)
         if "distance" in only:
+            part = configurations[: max(2, count // 8)]
             for beyond in (None, 0.05):
-                part = configurations[: max(2, count // 8)]
-                yield about | run_distance(device, clock, robot, around, part, beyond)
+                ask = partial(robot.check, part, around, "distance", beyond)
+                yield about | {"output": "distance", "beyond": beyond} | time_once(device, clock, ask, part)
         if "edges" in only:
+            # Between configurations that are free, a twentieth of the way to another.
             free = configurations[~robot.check(configurations, around)]
-            yield about | run_edges(device, clock, robot, around, free)
+            starts, others = np.array_split(free[: len(free) // 2 * 2], 2)
+            ask = partial(robot.check_edges, starts, starts + 0.05 * (others - starts), around)
+            rows = ask()
+            row = {"output": "edges", "clear": rows["clear"].mean(), "undecided": rows["undecided"].mean()}
+            yield about | row | time_once(device, clock, ask, starts)
+
+
+def time_once(device, clock, ask, asked):
+    """Return the columns of times of a question about configurations or edges."""
+    row = summarise(time_rounds({"ours": time_call(ask, device, clock)}, 1))
+    return {"asked": len(asked)} | row | {"per_s": round(1e3 * len(asked) / row["ours_ms"])}
 
 
 def run_any(device, clock, robot, around, configurations, sizes):
@@ -106,27 +119,8 @@ def run_any(device, clock, robot, around, configurations, sizes):
         "ours": time_call(lambda: robot.check(configurations, around), device, clock),
         "fcl": time_call(lambda: fcl_robot.any(poses), clock=clock),
     }
-    row = {"output": "any", "configurations": len(configurations), "meet": found.mean()}
+    row = {"output": "any", "asked": len(configurations), "meet": found.mean()}
     row["differ_from_fcl"] = (fcl_robot.any(poses) != found[: len(some)]).sum()
     row |= summarise(time_rounds(runs, sizes["repeats"]))
-    row["configurations_s"] = round(1e3 * len(configurations) / row["ours_ms"])
-    return row | {"fcl_configurations_s": round(1e3 * len(some) / row["fcl_ms"])}
-
-
-def run_distance(device, clock, robot, around, configurations, beyond):
-    """Return the columns of least distances."""
-    ask = time_call(lambda: robot.check(configurations, around, "distance", beyond), device, clock)
-    row = {"output": "distance", "beyond": beyond, "configurations": len(configurations)}
-    row |= summarise(time_rounds({"ours": ask}, 1))
-    return row | {"configurations_s": round(1e3 * len(configurations) / row["ours_ms"])}
-
-
-def run_edges(device, clock, robot, around, free):
-    """Return the columns of edges between configurations that are free, a twentieth of the way to another."""
-    starts = free[: len(free) // 2]
-    ends = starts + 0.05 * (free[len(free) // 2 :][: len(starts)] - starts)
-    rows = robot.check_edges(starts, ends, around)
-    times = time_rounds({"ours": time_call(lambda: robot.check_edges(starts, ends, around), device, clock)}, 1)
-    row = {"output": "edges", "configurations": len(starts), "clear": rows["clear"].mean()}
-    row |= {"undecided": rows["undecided"].mean()} | summarise(times)
-    return row | {"edges_s": round(1e3 * len(starts) / row["ours_ms"])}
+    per_s = {"per_s": round(1e3 * len(configurations) / row["ours_ms"])}
+    return row | per_s | {"fcl_per_s": round(1e3 * len(some) / row["fcl_ms"])}

@@ -7,7 +7,6 @@ by more than its times vary, within a run of this command or from one to the nex
 
 import importlib
 import json
-import os
 
 import numpy as np
 import warp as wp
@@ -41,7 +40,8 @@ def run(device, out, only=None, quick=False, command=None):
         line = {"case": name, **about, "series": measure(name, device, quick)}
         before = same_kind(lines, line)
         lines.append(line)
-        append_line(folder / "history.jsonl", line)
+        with open(folder / "history.jsonl", "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
         for series, was, now, noise in find_slower(before, line["series"]):
             print(f"slower: {name}: {series}: {was:.4g} -> {now:.4g} ms, {now / was:.2f} times; noise {noise:.2f}")
         print(f"{name}: {len(line['series'])} series, {len(before)} lines before", flush=True)
@@ -62,30 +62,17 @@ def measure(name, device, quick) -> dict:
 
 
 def read_history(path) -> list:
-    """Return the lines of a history, none where there is no file.
-
-    Raises:
-        StudyError: A line is not what this command writes.
-    """
+    """Return the lines of a history, none where there is no file; raise a StudyError at one of another command."""
     if not path.exists():
         return []
-    lines = []
-    for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-        try:
-            line = json.loads(text)
-            line["case"], line["device"], line["quick"], line["series"].items()
-        except (ValueError, KeyError, TypeError, AttributeError):
-            raise StudyError(f"{path}: line {number} is none of this command's; move the file away") from None
-        lines.append(line)
-    return lines
-
-
-def append_line(path, line):
-    """Append a line in one write."""
-    with open(path, "a", encoding="utf-8") as file:
-        file.write(json.dumps(line) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
+    lines = path.read_text(encoding="utf-8").splitlines()
+    try:
+        lines = list(map(json.loads, lines))
+        if all({"case", "device", "quick", "series"} <= set(line) for line in lines):
+            return lines
+    except (ValueError, TypeError):
+        pass
+    raise StudyError(f"{path}: a line is none of this command's; move the file away")
 
 
 def same_kind(lines, line) -> list:

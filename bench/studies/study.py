@@ -112,11 +112,7 @@ class StudyError(ValueError):
 
 
 def open_folder(device, out, only, names) -> Path:
-    """Return the folder to write to, which is made.
-
-    Raises:
-        StudyError: There is no such part, device or folder.
-    """
+    """Return the folder to write to, which is made; raise a StudyError where there is no such part or device."""
     wp.config.log_level = wp.LOG_WARNING
     unknown = sorted(set(only or ()) - set(names))
     if unknown:

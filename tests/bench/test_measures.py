@@ -9,7 +9,7 @@ import trimesh
 import warp_abtree as ab
 from bench import timing
 from bench.cases.update import bound_nodes
-from bench.studies.motions import Motions, PoseScene, find_first_contact
+from bench.studies.motions import Motions, find_first_contact
 from bench.studies.paper import update
 from bench.studies.tradeoff import regions, summaries, workload
 from warp_abtree.query.contacts import contact_dtypes
@@ -42,16 +42,19 @@ def test_fit_of_figure_6():
 
 @pytest.mark.parametrize("offset", [0.0, 3.0])
 def test_first_contact_of_boxes(device, offset):
-    """Cubes of side 1 meet where their centres are 1 apart, wherever B's own origin is; parts fit in the room."""
+    """Cubes of side 1 meet where their centres are 1 apart, wherever B's own origin is."""
     box = trimesh.creation.box()
     model, moved = (ab.Model.from_arrays(box.vertices + x, box.faces, base_faces=12) for x in (0, offset))
     motions = Motions(np.random.default_rng(0), 3, model, moved)
     motions.away[:] = np.eye(3)
     motions.rotations[:] = 0, 0, 0, 1
-    scene = PoseScene(device, (model, moved), (0, 0), motions.far, 2)
-    low, high = find_first_contact(scene.intersects, motions, steps=50)
+
+    def intersects(poses):
+        return ab.sweep(model, moved, poses, device=device)
+
+    low, high = find_first_contact(intersects, motions, steps=50)
     assert low == pytest.approx([1, 1, 1], abs=1e-9) and (high >= low).all()
-    assert scene.intersects(motions.poses(low)).all() and not scene.intersects(motions.poses(high)).any()
+    assert intersects(motions.poses(low)).all() and not intersects(motions.poses(high)).any()
     low, high = find_first_contact(lambda poses: poses[:, 0] + offset > 0.4, motions, steps=16)
     assert not np.isnan(low[0]) and np.isnan(low[1:]).all() and np.isnan(high[1:]).all()
     assert workload.judge_contact(low - 1)["never"] == 2

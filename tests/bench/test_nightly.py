@@ -42,6 +42,6 @@ def test_the_command_appends_a_line_a_case(tmp_path, capsys):
         file.write("{}")
     with pytest.raises(SystemExit):
         main.main(asked)
-    assert "line 3 is none of this command's" in capsys.readouterr().err
+    assert "a line is none of this command's" in capsys.readouterr().err
     with pytest.raises(StudyError, match="no part nothing"):
         nightly.run("cpu", tmp_path, only=["nothing"])

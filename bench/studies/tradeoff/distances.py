@@ -38,17 +38,16 @@ def measure(context, workload):
     poses, once = find_poses(context, workload)
     where = "CPU core" if context.device.is_cpu else "GPU"
     levels = {value: workload.lods(fraction=value) for value in context.size(FRACTIONS, QUICK_FRACTIONS)}
-    scenes = {value: workload.scene(lods, len(poses)) for value, lods in levels.items()}
-    truth = scenes[1].query(poses, "distance").run().distance
+    truth = workload.query(levels[1], poses, "distance").run().distance
     rows, queries = {}, {}
     for value, lods in levels.items():
         key = OURS, f"{value:.3g} of the faces"
-        queries[key] = query = scenes[value].query(poses, "distance")
+        queries[key] = query = workload.query(lods, poses, "distance")
         shown = workload.bound(lods), workload.fraction(lods), where
         rows[key] = describe(workload, OURS, query.run().distance, truth, *shown)
     for value in context.size(RELATIVE, RELATIVE[::2]):
         key = TOLERANCE, f"{value:.0%} of the distance"
-        queries[key] = query = scenes[1].query(poses, "distance", relative=value)
+        queries[key] = query = workload.query(levels[1], poses, "distance", relative=value)
         found = query.run()
         proved = (truth - found.bracket[:, 0]).mean()
         rows[key] = describe(workload, TOLERANCE, found.distance, truth, proved, 1.0, where)

@@ -45,10 +45,8 @@ class Contacts:
 
     def ask(self, fraction, tolerance):
         """Return a query of all motions."""
-        scene = self.workload.scene(self.workload.lods(fraction=fraction), len(self._starts))
-        scene.place(self._starts)
-        ends = np.concatenate([STILL, self._ends])
-        return ab.FirstContactQuery(scene.scene, ends, scene.pairs, tolerance=tolerance)
+        scene, pairs = self.workload.place(self.workload.lods(fraction=fraction), self._starts)
+        return ab.FirstContactQuery(scene, np.concatenate([STILL, self._ends]), pairs, tolerance=tolerance)
 
     def row(self, method, setting, found):
         """Return a row of times of contact, its own time aside."""
