@@ -7,7 +7,7 @@ Source: Liu et al. 2006, Algorithm 4.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import call
 from typing import Any
@@ -27,7 +27,7 @@ from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.budget_report import summarise_rows
 from warp_abtree.simulate.frame_file import FrameFile
 from warp_abtree.simulate.frame_graphs import FrameGraphs
-from warp_abtree.simulate.frame_row import FrameRow, LodTracker
+from warp_abtree.simulate.frame_row import ROW_FIELDS, FrameRow, LodTracker
 from warp_abtree.simulate.frame_stages import FrameStages
 from warp_abtree.state.work_lists import full_refit_fraction
 
@@ -183,8 +183,7 @@ class Frame(DeviceMemory):
             self._open, frame = None, OpenFrame(len(self.history) * self.time_step)
             captures, launches = self._captures and bool(self.history), []
             launch = launches.append if captures else call
-            self._select(stages, frame, captures)
-            stages = self._ready()  # LODs of a function may have changed the scene
+            stages = self._select(stages, frame, captures)
             launch(partial(stages.select, frame.rests))
             launch(partial(stages.refine, frame.rests))
             places = stages.bring_poses(frame.time)
@@ -196,29 +195,33 @@ class Frame(DeviceMemory):
                 graph = self._graphs.find((frame.rests, places), stages.arrays(), launches)
                 self._open = frame
                 wp.capture_launch(graph)
-                if not timer.uses_events:
-                    timer.mark("query_ms")
-            if stages.answer is None:
-                timer.mark("answer_ms")
-            if captures:
+                timer.mark("answer_ms" if timer.uses_events else "query_ms")
                 stages.look_ahead((len(self.history) + 1) * self.time_step)
-        if frame.is_short or not stages.is_whole():
+        if stages.answer is None and timer.marks[-1] != "answer_ms":
+            timer.mark("answer_ms")
+        found = stages.summary()
+        if frame.is_short or not stages.has_room(found):
             frame.is_short = True
             stages.grow()
             stages.respond()
+            found = stages.summary()
             frame.is_short = False
         stages.finish_bodies()
         if stages.answer is not None:
             stages.answer(stages.result(), self.time_step)
-        if timer.marks[-1] != "answer_ms":
+        if stages.answer is not None or timer.marks[-1] != "answer_ms":
             timer.mark("answer_ms")
-        self._record(stages, frame)
+        self._record(stages, frame, found)
         self._open = None
         for file in self._files:
             file.append(self.history)
 
-    def _select(self, stages, frame, captures):
-        """Do the host's part of the selection: tell the controller, or bring objects to the LODs of a function."""
+    def _select(self, stages, frame, captures) -> FrameStages:
+        """Do the host's part of the selection: tell the controller, or bring objects to the LODs of a function.
+
+        Returns:
+            The stages, made anew if that function has changed the scene.
+        """
         timer, controller, scene = self._timer, stages.controller, self.scene
         if controller is not None:
             last = self.history[-1] if self.history and stages.seen else None
@@ -228,17 +231,18 @@ class Frame(DeviceMemory):
             controller.prepare(replace(self._feedback, time=frame.time), frame.rests)
             if captures:
                 timer.mark("select_ms")
-            return
+            return stages
         timer.begin()
         wanted = None if self.lods is None else np.asarray(self.lods(frame.time))
         timer.mark("select_ms", lambda: {"selected": 0 if wanted is None else scene.object_count})
         if wanted is not None and not np.array_equal(wanted, scene.lods):
             frame.changes = scene.set_lods(wanted)
         timer.mark("refine_ms", lambda: {"lod_change": int(frame.changes is not None), "node_refitted": frame.refitted})
+        return stages if self.lods is None else self._ready()
 
-    def _record(self, stages, frame):
-        """Append the row of a frame, and keep what the next selection is told."""
-        found, stage_ms = stages.summary(), self._timer.stage_ms()
+    def _record(self, stages, frame, found):
+        """Append the row of a frame of which a summary was found, and keep what the next selection is told."""
+        stage_ms = self._timer.stage_ms()
         if frame.changes is not None:
             found |= {**self._lods.measure(self.scene), "nodes_refitted": frame.refitted}
         elif found["lods_changed"]:
@@ -251,7 +255,7 @@ class Frame(DeviceMemory):
         row = found | self._lods.columns | stage_ms
         row |= {"frame": len(self.history), "time": frame.time, "objects": self.scene.object_count}
         row["budget_ms"] = getattr(self.lods, "budget_ms", None)
-        self.history.append(FrameRow(**{field.name: row[field.name] for field in fields(FrameRow)}))
+        self.history.append(FrameRow(**{name: row[name] for name in ROW_FIELDS}))
 
     def summary(self, after: float = 1.0) -> dict:
         """Return mean, min and max of the counts, the range of LODs, and mean, p95 and total of stages [ms].

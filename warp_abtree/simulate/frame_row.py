@@ -68,7 +68,10 @@ class FrameRow:
     @classmethod
     def names(cls) -> list[str]:
         """Return the names of `as_dict` in their order."""
-        return [*(field.name for field in fields(cls)), "total_ms"]
+        return [*ROW_FIELDS, "total_ms"]
+
+
+ROW_FIELDS = tuple(field.name for field in fields(FrameRow))
 
 
 class LodColumns:

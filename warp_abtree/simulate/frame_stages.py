@@ -211,10 +211,9 @@ class FrameStages:
         values = self._host_summary.numpy()
         return {**dict(zip(WORDS, values[: len(WORDS)].tolist())), "levels": values[len(WORDS) :]}
 
-    def is_whole(self) -> bool:
-        """Return whether all buffers had room for what the last frame found, and it was launched. Waits for it."""
-        found, query = self.summary(), self.query
-        room = len(query.hits.uncertain)
+    def has_room(self, found: dict) -> bool:
+        """Return whether all buffers had room for what a frame has found, of which this is the summary."""
+        query, room = self.query, len(self.query.hits.uncertain)
         return (
             found["launched"] >= 0
             and 0 <= found["pairs"] <= len(query.pairs)
