@@ -122,10 +122,7 @@ class Frame(DeviceMemory):
         if not (clock is None or callable(clock)):
             raise ValueError(f"clock: a {type(clock).__name__} cannot be called")
         check_request("faces" if output == "contacts" else output, "exact")
-        self.scene = scene
-        self.motion = motion
-        self.lods = lods
-        self.output = output
+        self.scene, self.motion, self.lods, self.output = scene, motion, lods, output
         self.time_step = positive(time_step, "time_step")
         self.history: list[FrameRow] = []
         self._files: list[FrameFile] = []
@@ -149,8 +146,6 @@ class Frame(DeviceMemory):
             stages.controller.next_lods(self._feedback)
         if self.lods is not None:
             load_update_kernels(self.scene)
-        if stages.stepped is not None:
-            stages.stepped.warm_up(self.time_step)
         stages.warm_up()
         wp.synchronize_device(self.scene.device)
 
@@ -217,11 +212,7 @@ class Frame(DeviceMemory):
             file.append(self.history)
 
     def _select(self, stages, frame, captures) -> FrameStages:
-        """Do the host's part of the selection: tell the controller, or bring objects to the LODs of a function.
-
-        Returns:
-            The stages, made anew if that function has changed the scene.
-        """
+        """Do the host's part of the selection; return the stages, anew where a function of LODs changed the scene."""
         timer, controller, scene = self._timer, stages.controller, self.scene
         if controller is not None:
             last = self.history[-1] if self.history and stages.seen else None
@@ -248,14 +239,15 @@ class Frame(DeviceMemory):
         elif found["lods_changed"]:
             self._lods.columns = stages.table.columns(found["levels"])
         tests = found["node_tests"] + int(TRIANGLE_WORK) * found["triangle_tests"]
-        self._feedback = Feedback(frame.time, stage_ms, found["nodes_refitted"], float(tests))
-        stages.seen = found["frames"]
-        if stages.query.output == "any":
-            found["hits"] = None
         row = found | self._lods.columns | stage_ms
         row |= {"frame": len(self.history), "time": frame.time, "objects": self.scene.object_count}
         row["budget_ms"] = getattr(self.lods, "budget_ms", None)
-        self.history.append(FrameRow(**{name: row[name] for name in ROW_FIELDS}))
+        if stages.query.output == "any":
+            row["hits"] = None
+        self._feedback = Feedback(frame.time, stage_ms, found["nodes_refitted"], float(tests))
+        made = FrameRow(**{name: row[name] for name in ROW_FIELDS})
+        stages.seen = found["frames"]
+        self.history.append(made)
 
     def summary(self, after: float = 1.0) -> dict:
         """Return mean, min and max of the counts, the range of LODs, and mean, p95 and total of stages [ms].

@@ -45,7 +45,6 @@ class FrameStages:
         query: The query of the frame.
         grow, result: Functions that find with room for all that is found, and read it; both wait for the device.
         table: `LodColumns` of the levels of the controller; None without.
-        stepped: The motion, if it is one of rigid bodies, else None.
         answer: The motion's own response, or None.
         seen: Frames that the device has counted, up to the last one recorded.
     """
@@ -56,13 +55,15 @@ class FrameStages:
         self.scene, self.batch, self.device = scene, scene.batch(), scene.device
         self.motion, self.controller, self._output, self._time_step = motion, controller, output, time_step
         self._mark, self.seen = mark, 0
-        self.stepped = motion if isinstance(motion, SteppedMotion) else None
+        self._stepped = motion if isinstance(motion, SteppedMotion) else None
         self.answer, self._find_poses = getattr(motion, "answer", None), getattr(motion, "poses", None)
         self._memory = np.empty((scene.object_count, 7))
         self._ahead: tuple = (None, None)  # a time, and the poses then
-        self._dynamics = None if self.stepped is None else self.stepped.dynamics
+        self._dynamics = None if self._stepped is None else self._stepped.dynamics
         if self._dynamics is None:
-            self.query = query = self._make_query()
+            contacts = output == "contacts"
+            query = ContactQuery(scene, sort_pairs=True) if contacts else Query(scene, output, sort_pairs=True)
+            self.query, query.growth = query, 2
             self.result, self.grow, guards = query.result, query.grow, [query.guard]
         else:
             self.query = query = self._dynamics.query
@@ -82,12 +83,6 @@ class FrameStages:
         self._host_summary = self._summary
         if self.device.is_cuda:
             self._host_summary = wp.zeros(len(self._summary), dtype=wp.int64, device="cpu", pinned=True)
-
-    def _make_query(self):
-        contacts, scene = self._output == "contacts", self.scene
-        query = ContactQuery(scene, sort_pairs=True) if contacts else Query(scene, self._output, sort_pairs=True)
-        query.growth = 2
-        return query
 
     def _serve(self, controller):
         """Let objects stand at the levels of a controller's ladder."""
@@ -110,10 +105,12 @@ class FrameStages:
         if self._levels is not None and not self.batch.follows(self._levels):
             return False
         asks = self._filter, self._output
-        return self.stepped is not None or asks == (self.batch.filter_generation.number, output)
+        return self._stepped is not None or asks == (self.batch.filter_generation.number, output)
 
     def warm_up(self):
         """Load the kernels that no other operator has loaded, and make room for what is found; nothing moves."""
+        if self._stepped is not None:
+            self._stepped.warm_up(self._time_step)
         for module in (frame_summary, level_kernels, work_lists):
             wp.load_module(module, self.device)
         self.grow()
@@ -123,23 +120,19 @@ class FrameStages:
         return tuple(guard.given() for guard in self._guards)
 
     def bring_poses(self, time: float) -> bool:
-        """Bring to the device the poses of a frame that begins now [s]; return whether `move` has any to set.
-
-        Raises:
-            ValueError: Bad poses, or another number of them.
-        """
+        """Bring to the device the poses of a frame that begins at a time [s]; return whether there are any to set."""
         known, poses = self._ahead
         self._ahead = None, None
         if known != time:
             poses = self._poses(time)
-        if self.stepped is not None:
-            self.stepped.aim(time + self._time_step)
+        if self._stepped is not None:
+            self._stepped.aim(time + self._time_step)
         if poses is not None:
             self._upload.send(poses.ravel())
         return poses is not None
 
     def _poses(self, time):
-        """Return the poses of a time; None if there are none, or the motion has set those of the scene."""
+        """Return checked poses of a time; None if there are none, or the motion has set those of the scene."""
         poses = None if self._find_poses is None else self._find_poses(time, out=self._memory)
         if poses is None:
             return None
@@ -181,6 +174,11 @@ class FrameStages:
 
     def respond(self):
         """Summarise what was found, and let rigid bodies respond to it."""
+
+        def count():
+            found = self.summary()
+            return {"query": 1, "node_test": found["node_tests"], "triangle_test": found["triangle_tests"]}
+
         self._summary.zero_()
         if len(self._tests):
             self._tests.zero_()
@@ -191,13 +189,9 @@ class FrameStages:
         wp.launch(frame_summary.summarise_frame_kernel, dim, inputs, device=self.device)
         if self.device.is_cuda:
             wp.copy(self._host_summary, self._summary)
-        self._mark("query_ms", self._count_tests)
+        self._mark("query_ms", count)
         if self._dynamics is not None:
             self._dynamics.answer(self._time_step)
-
-    def _count_tests(self) -> dict:
-        found = self.summary()
-        return {"query": 1, "node_test": found["node_tests"], "triangle_test": found["triangle_tests"]}
 
     def finish_bodies(self):
         """Finish a step of rigid bodies that lacked room, see `Dynamics.finish`."""
