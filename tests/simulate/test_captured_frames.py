@@ -291,3 +291,23 @@ def test_frames_interrupted_anywhere_go_on(device, monkeypatch, captured):
 
     steps, _ = Interruption(device, monkeypatch).everywhere(make, lambda frame: frame.run(2) and None, check)
     assert steps > 10 and max(hits) > 100
+
+
+@pytest.mark.parametrize("captured", [False, True])
+def test_another_motion_is_followed(device, captured):
+    """Poses found ahead were those of the motion before; rigid bodies take over from where it has left the objects."""
+    dynamics, plain = heap(device), heap(device)
+    with testing.regime(captures_frames=captured):
+        frame = ab.Frame(dynamics.scene, None, None, "faces", 1 / 60)
+    start = dynamics.poses()
+    for offset in (0.3, 0.1, 0.0):
+        frame.motion = ab.Kinematic(start[:, :3] + offset, start[:, 3:])
+        frame.run(3)
+        assert np.allclose(dynamics.poses()[:, :3], start[:, :3] + offset, atol=1e-12)
+    plain.scene.set_poses(dynamics.poses())
+    dynamics.scene.set_poses(dynamics.poses())
+    frame.motion = dynamics.motion()
+    for _ in range(20):
+        frame.step()
+        plain.step(1 / 60)
+    assert np.array_equal(bits(dynamics), bits(plain)) and not np.allclose(dynamics.poses(), start)

@@ -75,6 +75,7 @@ class Timer:
 
     Attributes:
         counts_work: Whether the clock takes the counted work of each stage.
+        marks: Stages marked in this frame so far; what a graph marks again is added to them.
     """
 
     def __init__(self, device, clock):
@@ -84,12 +85,12 @@ class Timer:
         self.uses_events = clock is None and device.is_cuda
         made = MARKS_MOST if self.uses_events else 0
         self._events = [wp.Event(device, enable_timing=True) for _ in range(made)]
-        self._stages: list[str] = []
+        self.marks: list[str] = []
         self._readings: list[int] = []
 
     def begin(self):
         """Begin a frame."""
-        self._stages, self._readings = [], []
+        self.marks, self._readings = [], []
         self._read()
 
     def mark(self, stage: str, count=dict):
@@ -99,37 +100,33 @@ class Timer:
         """
         if self.device.is_capturing and not self.uses_events:
             return
-        self._stages.append(stage)
+        self.marks.append(stage)
         if self.counts_work:
             self.clock.charge(**count())
         self._read()
 
-    def marks(self) -> list[str]:
-        """Return the stages marked in this frame so far."""
-        return list(self._stages)
-
-    def replay(self, marks: list[str]):
-        """Take it that a graph marks these stages as it did when it was captured."""
-        if self.uses_events:
-            self._stages += marks
+    def close(self, stage: str):
+        """End a stage, unless it was the last that ended."""
+        if self.marks[-1] != stage:
+            self.mark(stage)
 
     def _read(self):
         if not self.uses_events:
             wp.synchronize_device(self.device)
             self._readings.append(round(1e9 * self.clock()))
             return
-        wp.get_stream(self.device).record_event(self._events[len(self._stages)])
+        wp.get_stream(self.device).record_event(self._events[len(self.marks)])
 
     def stage_ms(self) -> dict:
         """Return the stages of the frame [ms], exact to the nanosecond. (synchronization point on CUDA)"""
         if self.uses_events:
-            wp.synchronize_event(self._events[len(self._stages)])
-            pairs = zip(self._events, self._events[1 : len(self._stages) + 1])
+            wp.synchronize_event(self._events[len(self.marks)])
+            pairs = zip(self._events, self._events[1 : len(self.marks) + 1])
             spans = [round(1e6 * wp.get_event_elapsed_time(*pair, synchronize=False)) for pair in pairs]
         else:
             spans = np.diff(self._readings).tolist()
         total = dict.fromkeys(STAGES, 0)
-        for stage, span in zip(self._stages, spans, strict=True):
+        for stage, span in zip(self.marks, spans, strict=True):
             total[stage] += span
         return {stage: span / 1e6 for stage, span in total.items()}
 

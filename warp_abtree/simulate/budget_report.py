@@ -1,6 +1,12 @@
-"""Report of a run of frames against its time budget: `budget_report`; the least it can cost: `cost_at_coarsest`."""
+"""Reports of a run of frames: `summarise_rows`; against its time budget: `budget_report`, `cost_at_coarsest`."""
+
+from functools import partial
 
 import numpy as np
+
+from warp_abtree.lod.timing import STAGES
+
+COUNTS = "states pairs intersecting hits faces nodes_refitted node_tests triangle_tests error_mean error_max".split()
 
 
 def budget_report(rows, budget_ms: float | None = None, after: float = 1.0) -> dict | None:
@@ -43,3 +49,24 @@ def cost_at_coarsest(rows) -> float | None:
     """
     costs = [row.total_ms for row in rows[1:] if row.lod_max == 0]
     return float(np.median(costs)) if costs and 2 * len(costs) >= len(rows) - 1 else None
+
+
+def summarise_rows(rows, after: float = 1.0) -> dict:
+    """Return `Frame.summary` of one `FrameRow` or more."""
+
+    def reduce(name, **reductions):
+        values = np.array([getattr(row, name) for row in rows], np.float64)  # None is NaN
+        return {key: float(reduction(values)) for key, reduction in reductions.items()}
+
+    p95, budget = partial(np.percentile, q=95), rows[-1].budget_ms
+    return {
+        "frames": len(rows),
+        "objects": rows[-1].objects,
+        "stages": {name: reduce(name, mean=np.mean, p95=p95, total=np.sum) for name in (*STAGES, "total_ms")},
+        **{name: reduce(name, mean=np.mean, min=np.min, max=np.max) for name in COUNTS},
+        "lod_min": min(row.lod_min for row in rows),
+        "lod_max": max(row.lod_max for row in rows),
+        "budget_ms": budget,
+        "coarsest_ms": None if budget is None else cost_at_coarsest(rows),
+        "budget": budget_report(rows, after=after),
+    }

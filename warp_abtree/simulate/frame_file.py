@@ -17,32 +17,29 @@ class FrameFile:
 
     def __init__(self, path):
         self.path = Path(path)
+        self._is_json = self.path.suffix.lower() == ".json"
+        self._tail = b"\n]\n" if self._is_json else b""
         self._written, self._end = 0, 0  # rows, and bytes without the tail
-        self._opening, self._comma, self._tail = (b"[\n", b",\n", b"\n]\n") if self._is_json() else (b"", b"", b"")
-
-    def _is_json(self):
-        return self.path.suffix.lower() == ".json"
 
     def append(self, history: list[FrameRow]):
         """Write the rows that are not in the file yet; where that raises OSError, the file holds those before."""
         rows = [row.as_dict() for row in history[self._written :]]
         if not rows:
             return
-        first = not self._written
-        data = (self._opening if first else self._comma) + self._encode(rows, first)
-        if first:
+        data = self._encode(rows)
+        if self._written:
+            self._write_at_end(data + self._tail)
+        else:
             with atomic_write(self.path) as file:
                 file.write(data + self._tail)
-        else:
-            self._write_at_end(data + self._tail)
         self._written, self._end = len(history), self._end + len(data)
 
-    def _encode(self, rows, with_names) -> bytes:
-        if self._is_json():
-            return self._comma.join(json.dumps(row).encode() for row in rows)
+    def _encode(self, rows) -> bytes:
+        if self._is_json:
+            return ((",\n" if self._written else "[\n") + ",\n".join(map(json.dumps, rows))).encode()
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, FrameRow.names())
-        if with_names:
+        if not self._written:
             writer.writeheader()
         writer.writerows(rows)
         return text.getvalue().encode()

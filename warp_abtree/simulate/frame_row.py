@@ -68,7 +68,10 @@ class FrameRow:
     @classmethod
     def names(cls) -> list[str]:
         """Return the names of `as_dict` in their order."""
-        return [*(field.name for field in fields(cls)), "total_ms"]
+        return [*ROW_FIELDS, "total_ms"]
+
+
+ROW_FIELDS = tuple(field.name for field in fields(FrameRow))
 
 
 class LodColumns:
@@ -97,3 +100,33 @@ class LodColumns:
             "error_mean": float(sum((error * repeats).tolist()) / int(repeats.sum())),
             "error_max": float(error.max()),
         }
+
+
+class LodTracker:
+    """LODs of the objects of a scene from frame to frame, as the host knows them.
+
+    Attributes:
+        columns: Columns of a `FrameRow` about the LODs last measured.
+    """
+
+    columns: dict[str, Any]
+
+    def __init__(self, scene):
+        self._direction = np.zeros(scene.object_count, np.int8)
+        self.restart(scene)
+
+    def restart(self, scene):
+        """Take the LODs as they stand for those of the last frame."""
+        self._lods = scene.batch().lods
+        self.measure(scene)
+
+    def measure(self, scene) -> dict:
+        """Measure the LODs as they stand; return columns: how many changed, and how many of these turned back."""
+        lods = scene.lods.astype(np.int64)
+        direction = np.sign(lods - self._lods).astype(np.int8)
+        turned = np.count_nonzero(direction * self._direction < 0)
+        self._direction = np.where(direction == 0, self._direction, direction)
+        self._lods = lods
+        keys, repeats = np.unique((np.array(scene.object_model, np.int64) << 32) + lods, return_counts=True)
+        self.columns = LodColumns(scene.models, keys >> 32, keys & (2**32 - 1)).columns(repeats)
+        return {"lods_changed": int(np.count_nonzero(direction)), "oscillations": int(turned)}
