@@ -65,10 +65,10 @@ def test_many_subtrees_share_little_memory(monkeypatch):
     with testing.regime(plain_tests=0):
         query = ab.Query(scene, "faces", pairs=[(0, 1)])
         found = [query.run().faces]
-        assert query.slab_memory.shape[1] > slab_memory_words(0), "more subtrees than slots"
+        assert query.traversal.slab_memory.shape[1] > slab_memory_words(0), "more subtrees than slots"
         monkeypatch.setattr(descent, "slab_memory_words", lambda depth: slab_memory_words(0))
         query = ab.Query(scene, "faces", pairs=[(0, 1)])
-        assert query.slab_memory.shape[1] == slab_memory_words(0)
+        assert query.traversal.slab_memory.shape[1] == slab_memory_words(0)
         found.append(query.run().faces)
     for faces in found:
         np.testing.assert_array_equal(faces, expected.faces)

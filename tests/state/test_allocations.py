@@ -123,7 +123,7 @@ def test_a_query_has_room_for_its_output_alone(device, allocations, kind):
         wide, narrow = (held("any", capacity=ab.Buffers(uncertain=count)) for count in (room, 1))
         assert wide - narrow == 24 * (room - 1) and rounded < least, "the exact stage has a list of its own"
     else:
-        most = 300 * len(pairs) + query.slab_memory.capacity + SLACK
+        most = 300 * len(pairs) + query.traversal.slab_memory.capacity + SLACK
         assert rounded == least < most, "one thread a pair: no lists between stages"
 
 

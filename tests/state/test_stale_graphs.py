@@ -132,7 +132,7 @@ def test_a_graph_keeps_its_arrays(device):
     scene = make_scene(device)
     query = OwnQuery(scene, "faces", capacity=8)
     captured, states, objects = capture(device, query), query.batch.states.pool, query.batch.objects.pool
-    kept = [query.hits.face, query.hits.any_hit, query.pair_poses, query.pairs, query.work.counter]
+    kept = [query.hits.face, query.hits.any_hit, query.pair_poses, query.pairs, query.traversal.work.counter]
     kept += [states.node_box, states.face_corner, states.lod, objects.state, objects.rotation]
     kept += [query.broad_phase.lower, query.broad_phase.excluded, query.broad_phase.bvh, query.guard.launched]
     alive = [weakref.ref(array) for array in kept]

@@ -171,11 +171,7 @@ class Operator(DeviceMemory):
         """
         asked = zip((pairs, hits, uncertain), self.rooms, strict=True)
         rooms = Rooms(*(now if wanted is None else wanted for wanted, now in asked))
-        made = self._make(rooms)
-        with self.changing():
-            self._replace(made, rooms)
-            if self.broad_phase is not None:
-                self._fill_distances()
+        self._replace(self._make(rooms), rooms)
 
     def resize(self, capacity: int):
         """Make room for a number of intersecting face pairs."""
@@ -187,10 +183,12 @@ class Operator(DeviceMemory):
         with self.changing():
             for owner, name, array in made:
                 setattr(owner, name, array)
-            self.rooms = rooms
+            others, self.rooms = rooms.pairs != self.rooms.pairs, rooms
             for stage in self.stages:
                 stage.link()
             self.readout.link()
+            if others and self.broad_phase is not None:
+                self._fill_distances()
 
     @contextmanager
     def changing(self):

@@ -13,12 +13,12 @@ PRECISIONS = {"exact": predicates.EXACT, "float32": predicates.FLOAT32}
 
 PRECISION_NAMES = tuple(PRECISIONS)  # found without a hash
 
-# Options that each output takes beside precision, in a scene and in a sweep, and all of each.
+# Options that each output takes beside precision: in a scene, in a sweep, in a sweep of motions; and all of each.
 _HITS, _DISTANCE = ("within",), ("tolerance", "relative", "beyond", "signed", "originals")
 SCENE_OPTIONS = {"any": _HITS, "count": _HITS, "faces": _HITS, "contacts": ("within", "gap"), "distance": _DISTANCE}
 SWEEP_OPTIONS = {"any": _HITS, "count": _HITS, "faces": (), "distance": _DISTANCE}
-SWEEP_OPTIONS["first_contact"] = "end_poses", "tolerance", "screw", "linear"
-_KNOWN = {id(taken): frozenset(sum(taken.values(), ())) for taken in (SCENE_OPTIONS, SWEEP_OPTIONS)}
+MOTION_OPTIONS = {"first_contact": ("end_poses", "tolerance", "screw", "linear")}
+_KNOWN = {id(taken): frozenset(sum(taken.values(), ())) for taken in (SCENE_OPTIONS, SWEEP_OPTIONS, MOTION_OPTIONS)}
 
 # A launch of 32 threads a pair stays within 2^31.
 PAIRS_MAX = 2**26
@@ -88,7 +88,7 @@ def check_options(caller: str, taken: dict, output: str, precision: str, options
     """Return the options of an output that are neither None nor False.
 
     Args:
-        taken: `SCENE_OPTIONS` or `SWEEP_OPTIONS`.
+        taken: One of the tables above.
 
     Raises:
         TypeError: An option that none of the outputs has.

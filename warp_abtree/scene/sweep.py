@@ -16,7 +16,7 @@ from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.base.arrays import NONE_REFUSED
 from warp_abtree.kernels.io.sweep import pose_placer, report_chunk_kernel
 from warp_abtree.query.operator import Operator
-from warp_abtree.query.request import SWEEP_OPTIONS, check_options, check_within, refuse_signed
+from warp_abtree.query.request import MOTION_OPTIONS, SWEEP_OPTIONS, check_options, check_within, refuse_signed
 from warp_abtree.query.stages.distance import DistanceQuery, check_beyond, check_distance_options
 from warp_abtree.query.stages.first_contact import FirstContactQuery
 from warp_abtree.query.stages.intersect import Query
@@ -342,8 +342,9 @@ def sweep(
 
 def _check_request(output, precision, options) -> dict:
     """Return the options that are given, checked but for the poses."""
-    given = check_options("sweep", SWEEP_OPTIONS, output, precision, options)
-    if output == "first_contact":
+    moves = output == "first_contact"
+    given = check_options("sweep", MOTION_OPTIONS if moves else SWEEP_OPTIONS, output, precision, options)
+    if moves:
         if "end_poses" not in given:
             raise TypeError(f"sweep needs end_poses for output {output!r}")
         FirstContactQuery.plan(**{name: value for name, value in given.items() if name != "end_poses"})

@@ -62,11 +62,12 @@ class FrameStages:
         self._dynamics = None if self._stepped is None else self._stepped.dynamics
         if self._dynamics is None:
             contacts = output == "contacts"
-            query = ContactQuery(scene, sort_pairs=True) if contacts else Query(scene, output, sort_pairs=True)
+            query: Any = ContactQuery(scene, sort_pairs=True) if contacts else Query(scene, output, sort_pairs=True)
             self.query, query.growth = query, 2
             self.result, self.grow, guards = query.result, query.grow, [query.guard]
         else:
-            self.query = query = self._dynamics.query
+            query = self._dynamics.query
+            self.query = query
             self.result, self.grow = partial(query.result, with_points=False), self._dynamics.find_contacts
             guards = [part.guard for part in (query, self._dynamics.certified) if part is not None]
         self._guards, self._filter = guards, self.batch.filter_generation.number

@@ -134,7 +134,7 @@ class DistanceStage(Stage):
     def attach(self, operator: Operator):
         """Take the operator."""
         super().attach(operator)
-        refuse_signed(self._signed and operator.given is None, operator.batch.has_solid())
+        refuse_signed(self._signed, operator.batch.has_solid(operator.given))
         self.slabs.due_count = wp.zeros(1, dtype=wp.int32, device=operator.device)
 
     def kernels(self, device) -> list:
