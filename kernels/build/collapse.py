@@ -62,14 +62,6 @@ class Surface:
     stamp: wp.array(dtype=int)  # [node_capacity], last node that met this one as a neighbour
 
 
-@wp.struct
-class Placement:
-    """Where the merged node of an edge goes."""
-
-    pos: wp.vec3d  # normalised
-    cost: wp.float64  # quadric error there
-
-
 @wp.func_native(native.body("build/fetch_edges.h", "fetch_edges"))
 def fetch_edges(surface: Surface, rings: Rings, heap: Heap, size: wp.int32):
     """Prefetch what the next merges will read into the caches of this core."""
@@ -84,29 +76,24 @@ def edge_quadric(surface: Surface, a: int, b: int):
 
 @wp.func
 def place_edge(surface: Surface, a: int, b: int, q: Quadric):
-    """Choose the position of the merged node: the minimum of the quadric, else the best of midpoint and ends."""
+    """Return where the merged node goes, to the minimum of the quadric, else midpoint or end, and the error there."""
     pa = surface.pos[a]
     pb = surface.pos[b]
     h = (pb - pa) * wp.float64(0.5)
-    mid = pa + h
-    place = Placement()
     y = quadric_minimum(q, wp.length(h) * wp.float64(2.0) * MAX_REACH)
     if wp.isfinite(y[0]):
-        place.pos = mid + y
-        place.cost = quadric_error(q, y)
-        return place
-    place.pos = mid
-    place.cost = q[9]
+        return pa + h + y, quadric_error(q, y)
+    pos = pa + h
+    cost = q[9]
     cost_a = quadric_error(q, -h)
     cost_b = quadric_error(q, h)
-    if cost_a < place.cost:
-        place.pos = pa
-        place.cost = cost_a
-    if cost_b < place.cost:
-        place.pos = pb
-        place.cost = cost_b
-    place.cost = wp.max(place.cost, wp.float64(0.0))
-    return place
+    if cost_a < cost:
+        pos = pa
+        cost = cost_a
+    if cost_b < cost:
+        pos = pb
+        cost = cost_b
+    return pos, wp.max(cost, wp.float64(0.0))
 
 
 @wp.func
@@ -167,8 +154,8 @@ def push_ring(surface: Surface, rings: Rings, heap: Heap, size: int, c: int):
             n = rings.corner_node[3 * f + (k + turn) % 3]
             if surface.stamp[n] != c:
                 surface.stamp[n] = c
-                place = place_edge(surface, n, c, edge_quadric(surface, n, c))
-                size = heap_push(heap, size, place.cost, pack_pair(n, c, FRESH))
+                _, cost = place_edge(surface, n, c, edge_quadric(surface, n, c))
+                size = heap_push(heap, size, cost, pack_pair(n, c, FRESH))
         k = rings.next[k]
     return size
 
@@ -226,8 +213,8 @@ def price_edges_kernel(
     for i in range(edge_count):
         a = pair_first(edge_pair[i])
         b = pair_second(edge_pair[i])
-        place = place_edge(surface, a, b, edge_quadric(surface, a, b))
-        key_out[i] = place.cost
+        _, cost = place_edge(surface, a, b, edge_quadric(surface, a, b))
+        key_out[i] = cost
 
 
 @wp.kernel
@@ -317,15 +304,15 @@ def collapse_edges_kernel(
                 # never merge away the last faces of the model
                 if dying < live:
                     q = edge_quadric(surface_inout, a, b)
-                    place = place_edge(surface_inout, a, b, q)
+                    pos, cost = place_edge(surface_inout, a, b, q)
                     old = pair_stage(pair)
-                    stage = postponed_stage(surface_inout, rings_inout, a, b, old, dying, place.pos)
+                    stage = postponed_stage(surface_inout, rings_inout, a, b, old, dying, pos)
                     if stage != old:
-                        key = postponed_key(surface_inout, rings_inout, a, b, stage, q, place.cost)
+                        key = postponed_key(surface_inout, rings_inout, a, b, stage, q, cost)
                         size = heap_push(heap_inout, size, key, pack_pair(a, b, stage))
                     else:
                         c = vertex_count + merges
-                        commit_merge(surface_inout, rings_inout, a, b, c, q, place.pos)
+                        commit_merge(surface_inout, rings_inout, a, b, c, q, pos)
                         merge_pair_out[merges] = wp.vec2i(a, b)
                         size = push_ring(surface_inout, rings_inout, heap_inout, size, c)
                         merges += 1
