@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line, warn_caller
+from warp_abtree.checks.arguments import first_line
 from warp_abtree.interop.robot.description import (
     Description,
     Part,
@@ -17,7 +17,7 @@ from warp_abtree.interop.robot.description import (
     unit_axis,
 )
 from warp_abtree.interop.robot.urdf import INSTALL
-from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
+from warp_abtree.model.files.found import FileSurface, MeshError, Remarks, warn_caller
 from warp_abtree.model.files.read import read_file, split_file_name
 
 MJCF_JOINTS = {"hinge": "revolute", "slide": "prismatic"}

@@ -9,21 +9,14 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import (
-    check_device,
-    flag,
-    is_device_array,
-    to_numpy,
-    warn_caller,
-    whole_number,
-    wrap_array,
-)
+from warp_abtree.checks.arguments import check_device, flag, is_device_array, to_numpy, whole_number, wrap_array
 from warp_abtree.interop.robot.check import RobotQuery, check_edges
 from warp_abtree.interop.robot.description import Description, RobotError
 from warp_abtree.interop.robot.mjcf import read_mjcf
 from warp_abtree.interop.robot.surroundings import make_surroundings
 from warp_abtree.interop.robot.urdf import apply_srdf, read_urdf
 from warp_abtree.kernels.robot import forward
+from warp_abtree.model.files.found import warn_caller
 from warp_abtree.model.model import Model
 from warp_abtree.query.distance import check_beyond
 from warp_abtree.scene.scene import Scene

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line, warn_caller
+from warp_abtree.checks.arguments import first_line
 from warp_abtree.interop.robot.description import (
     Description,
     Part,
@@ -21,6 +21,7 @@ from warp_abtree.interop.robot.description import (
     join_meshes,
     unit_axis,
 )
+from warp_abtree.model.files.found import warn_caller
 from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.mesh import MeshError, load_mesh
 
