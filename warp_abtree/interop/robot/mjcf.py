@@ -208,10 +208,8 @@ def _shape(mujoco, model, g, where):
         made = trimesh.creation.capsule(radius=size[0], height=2 * size[1])
         made.apply_translation(-made.bounds.mean(0))
     else:
-        raise RobotError(
-            f"{where}: geom {model.geom(g).name or g!r} is a {kind}, which has no mesh; what surrounds the robot is "
-            "given to Robot.check"
-        )
+        told = f"{where}: geom {model.geom(g).name or g!r} is a {kind}, which has no mesh"
+        raise RobotError(f"{told}; what surrounds the robot is given to Robot.check")
     return np.asarray(made.vertices), np.asarray(made.faces)
 
 

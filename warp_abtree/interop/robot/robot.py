@@ -163,11 +163,9 @@ class Robot:
         """
         check_device(self.device, "Robot.forward")
         rows = self._take(configurations, limits)
-        frames = forward.Frames()
-        shape = len(rows), len(self.description.frames)
-        frames.rotation, frames.position = (
-            wp.empty(shape, dtype=dtype, device=self.device) for dtype in (wp.mat33d, wp.vec3d)
-        )
+        frames, shape = forward.Frames(), (len(rows), len(self.description.frames))
+        frames.rotation = wp.empty(shape, dtype=wp.mat33d, device=self.device)
+        frames.position = wp.empty(shape, dtype=wp.vec3d, device=self.device)
         poses = wp.empty((len(rows), len(self._links)), dtype=wp.mat44d, device=self.device)
         if len(rows):
             wp.launch(forward.forward_kernel, len(rows), [self._chain, rows, frames], device=self.device)
