@@ -6,26 +6,9 @@ Source: Garland and Heckbert, "Surface simplification using quadric error metric
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.build.heap import (
-    Heap,
-    heap_drop_top,
-    heap_push,
-    pack_pair,
-    pair_first,
-    pair_second,
-    pair_stage,
-    sift_down,
-)
+from warp_abtree.kernels.build import heap as queue
+from warp_abtree.kernels.build import vertex_forest as forest
 from warp_abtree.kernels.build.quadric import Quadric, quadric_error, quadric_minimum, quadric_moved, quadric_plane
-from warp_abtree.kernels.build.vertex_forest import (
-    Rings,
-    absorb_ring,
-    are_distinct,
-    count_dying,
-    face_corners,
-    third_corner,
-    third_vertices_live,
-)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -62,16 +45,8 @@ class Surface:
     stamp: wp.array(dtype=int)  # [node_capacity], last node that met this one as a neighbour
 
 
-@wp.struct
-class Placement:
-    """Where the merged node of an edge goes."""
-
-    pos: wp.vec3d  # normalised
-    cost: wp.float64  # quadric error there
-
-
 @wp.func_native(native.body("build/fetch_edges.h", "fetch_edges"))
-def fetch_edges(surface: Surface, rings: Rings, heap: Heap, size: wp.int32):
+def fetch_edges(surface: Surface, rings: forest.Rings, heap: queue.Heap, size: wp.int32):
     """Prefetch what the next merges will read into the caches of this core."""
 
 
@@ -84,40 +59,35 @@ def edge_quadric(surface: Surface, a: int, b: int):
 
 @wp.func
 def place_edge(surface: Surface, a: int, b: int, q: Quadric):
-    """Choose the position of the merged node: the minimum of the quadric, else the best of midpoint and ends."""
+    """Return where the merged node goes, to the minimum of the quadric, else midpoint or end, and the error there."""
     pa = surface.pos[a]
     pb = surface.pos[b]
     h = (pb - pa) * wp.float64(0.5)
-    mid = pa + h
-    place = Placement()
     y = quadric_minimum(q, wp.length(h) * wp.float64(2.0) * MAX_REACH)
     if wp.isfinite(y[0]):
-        place.pos = mid + y
-        place.cost = quadric_error(q, y)
-        return place
-    place.pos = mid
-    place.cost = q[9]
+        return pa + h + y, quadric_error(q, y)
+    pos = pa + h
+    cost = q[9]
     cost_a = quadric_error(q, -h)
     cost_b = quadric_error(q, h)
-    if cost_a < place.cost:
-        place.pos = pa
-        place.cost = cost_a
-    if cost_b < place.cost:
-        place.pos = pb
-        place.cost = cost_b
-    place.cost = wp.max(place.cost, wp.float64(0.0))
-    return place
+    if cost_a < cost:
+        pos = pa
+        cost = cost_a
+    if cost_b < cost:
+        pos = pb
+        cost = cost_b
+    return pos, wp.max(cost, wp.float64(0.0))
 
 
 @wp.func
-def component_extent(surface: Surface, rings: Rings, a: int, b: int):
+def component_extent(surface: Surface, rings: forest.Rings, a: int, b: int):
     """Return the longest squared edge of a connected component whose faces all have both a and b."""
     size = wp.length_sq(surface.pos[b] - surface.pos[a])
     k = rings.head[a]
     while k >= 0:
         f = k // 3
         if rings.corner_node[3 * f] >= 0:
-            third = third_corner(f, a, b, rings.corner_node)
+            third = forest.third_corner(f, a, b, rings.corner_node)
             if third >= 0:
                 size = wp.max(size, wp.length_sq(surface.pos[third] - surface.pos[a]))
                 size = wp.max(size, wp.length_sq(surface.pos[third] - surface.pos[b]))
@@ -126,13 +96,13 @@ def component_extent(surface: Surface, rings: Rings, a: int, b: int):
 
 
 @wp.func
-def ring_flips(surface: Surface, rings: Rings, node: int, other: int, target: wp.vec3d):
+def ring_flips(surface: Surface, rings: forest.Rings, node: int, other: int, target: wp.vec3d):
     """Tell whether moving `node` to the target turns a surviving face by more than arccos(MIN_COS)."""
     k = rings.head[node]
     while k >= 0:
         f = k // 3
         if rings.corner_node[3 * f] >= 0:
-            if third_corner(f, node, other, rings.corner_node) < 0:
+            if forest.third_corner(f, node, other, rings.corner_node) < 0:
                 p = surface.pos[rings.corner_node[3 * f + (k + 1) % 3]]
                 q = surface.pos[rings.corner_node[3 * f + (k + 2) % 3]]
                 before = wp.cross(p - surface.pos[node], q - surface.pos[node])
@@ -146,19 +116,19 @@ def ring_flips(surface: Surface, rings: Rings, node: int, other: int, target: wp
 
 
 @wp.func
-def commit_merge(surface: Surface, rings: Rings, a: int, b: int, c: int, q: Quadric, pos: wp.vec3d):
+def commit_merge(surface: Surface, rings: forest.Rings, a: int, b: int, c: int, q: Quadric, pos: wp.vec3d):
     """Make node c at `pos` of nodes a and b."""
     mid = surface.pos[a] + (surface.pos[b] - surface.pos[a]) * wp.float64(0.5)
     surface.pos[c] = pos
     surface.quadric[c] = quadric_moved(q, pos - mid)
     surface.parent[a] = c
     surface.parent[b] = c
-    tail = absorb_ring(rings, a, a, b, c, -1)
-    tail = absorb_ring(rings, b, a, b, c, tail)
+    tail = forest.absorb_ring(rings, a, a, b, c, -1)
+    tail = forest.absorb_ring(rings, b, a, b, c, tail)
 
 
 @wp.func
-def push_ring(surface: Surface, rings: Rings, heap: Heap, size: int, c: int):
+def push_ring(surface: Surface, rings: forest.Rings, heap: queue.Heap, size: int, c: int):
     """Push the edges of the new node c, each once; return the heap's new size."""
     k = rings.head[c]
     while k >= 0:
@@ -167,8 +137,8 @@ def push_ring(surface: Surface, rings: Rings, heap: Heap, size: int, c: int):
             n = rings.corner_node[3 * f + (k + turn) % 3]
             if surface.stamp[n] != c:
                 surface.stamp[n] = c
-                place = place_edge(surface, n, c, edge_quadric(surface, n, c))
-                size = heap_push(heap, size, place.cost, pack_pair(n, c, FRESH))
+                _, cost = place_edge(surface, n, c, edge_quadric(surface, n, c))
+                size = queue.heap_push(heap, size, cost, queue.pack_pair(n, c, FRESH))
         k = rings.next[k]
     return size
 
@@ -186,8 +156,8 @@ def weigh_faces_kernel(
         boundary: 1 where edge k to k+1 of the face has no other face, shape [face_count, 3].
     """
     for f in range(face_count):
-        corner = face_corners(face_vertex, f)
-        if are_distinct(corner):
+        corner = forest.face_corners(face_vertex, f)
+        if forest.are_distinct(corner):
             px = surface_inout.pos[corner[0]]
             py = surface_inout.pos[corner[1]]
             pz = surface_inout.pos[corner[2]]
@@ -224,16 +194,16 @@ def price_edges_kernel(
         edge_pair: Packed edges, stage FRESH, shape [edge_count].
     """
     for i in range(edge_count):
-        a = pair_first(edge_pair[i])
-        b = pair_second(edge_pair[i])
-        place = place_edge(surface, a, b, edge_quadric(surface, a, b))
-        key_out[i] = place.cost
+        a = queue.pair_first(edge_pair[i])
+        b = queue.pair_second(edge_pair[i])
+        _, cost = place_edge(surface, a, b, edge_quadric(surface, a, b))
+        key_out[i] = cost
 
 
 @wp.kernel
 def compact_heap_kernel(
     surface: Surface,
-    heap_inout: Heap,
+    heap_inout: queue.Heap,
     counter_inout: wp.array(dtype=int),
 ):
     """Drop the stale entries and order the rest as a heap (serial, dim=1)."""
@@ -241,23 +211,23 @@ def compact_heap_kernel(
     kept = int(0)
     for i in range(size):
         pair = heap_inout.pair[i]
-        if surface.parent[pair_first(pair)] < 0 and surface.parent[pair_second(pair)] < 0:
+        if surface.parent[queue.pair_first(pair)] < 0 and surface.parent[queue.pair_second(pair)] < 0:
             heap_inout.key[kept] = heap_inout.key[i]
             heap_inout.pair[kept] = pair
             kept += 1
     i = (kept - 2) // 4
     while kept > 1 and i >= 0:
-        sift_down(heap_inout, kept, i, heap_inout.key[i], heap_inout.pair[i])
+        queue.sift_down(heap_inout, kept, i, heap_inout.key[i], heap_inout.pair[i])
         i -= 1
     counter_inout[HEAP_SIZE] = kept
 
 
 @wp.func
-def postponed_stage(surface: Surface, rings: Rings, a: int, b: int, stage: int, dying: int, pos: wp.vec3d):
+def postponed_stage(surface: Surface, rings: forest.Rings, a: int, b: int, stage: int, dying: int, pos: wp.vec3d):
     """Return the stage at which the edge may merge; its own stage if that is now."""
     rest = rings.degree[a] + rings.degree[b] - 2 * dying
     if stage < LAST and rest == 0:
-        if not third_vertices_live(rings, a, b):
+        if not forest.third_vertices_live(rings, a, b):
             return LAST
     if stage < PENALISED:
         if rest > MAX_VALENCE:
@@ -268,7 +238,7 @@ def postponed_stage(surface: Surface, rings: Rings, a: int, b: int, stage: int, 
 
 
 @wp.func
-def postponed_key(surface: Surface, rings: Rings, a: int, b: int, stage: int, q: Quadric, cost: wp.float64):
+def postponed_key(surface: Surface, rings: forest.Rings, a: int, b: int, stage: int, q: Quadric, cost: wp.float64):
     """Return the key of a postponed edge: a soft penalty, or after all other merges, smallest component first."""
     if stage == LAST:
         return POSTPONED_KEY * (wp.float64(1.0) + component_extent(surface, rings, a, b))
@@ -283,8 +253,8 @@ def collapse_edges_kernel(
     merge_budget: int,
     heap_capacity: int,
     surface_inout: Surface,
-    rings_inout: Rings,
-    heap_inout: Heap,
+    rings_inout: forest.Rings,
+    heap_inout: queue.Heap,
     counter_inout: wp.array(dtype=int),
     merge_pair_out: wp.array(dtype=wp.vec2i),
 ):
@@ -304,28 +274,28 @@ def collapse_edges_kernel(
             status = int(FINISHED)
         else:
             pair = heap_inout.pair[0]
-            a = pair_first(pair)
-            b = pair_second(pair)
+            a = queue.pair_first(pair)
+            b = queue.pair_second(pair)
             if surface_inout.parent[a] >= 0 or surface_inout.parent[b] >= 0:
-                size = heap_drop_top(heap_inout, size)
+                size = queue.heap_drop_top(heap_inout, size)
             elif size + 2 * (rings_inout.degree[a] + rings_inout.degree[b]) > heap_capacity:
                 status = int(HEAP_FULL)
             else:
-                size = heap_drop_top(heap_inout, size)
+                size = queue.heap_drop_top(heap_inout, size)
                 fetch_edges(surface_inout, rings_inout, heap_inout, size)
-                dying = count_dying(rings_inout, a, b)
+                dying = forest.count_dying(rings_inout, a, b)
                 # never merge away the last faces of the model
                 if dying < live:
                     q = edge_quadric(surface_inout, a, b)
-                    place = place_edge(surface_inout, a, b, q)
-                    old = pair_stage(pair)
-                    stage = postponed_stage(surface_inout, rings_inout, a, b, old, dying, place.pos)
+                    pos, cost = place_edge(surface_inout, a, b, q)
+                    old = queue.pair_stage(pair)
+                    stage = postponed_stage(surface_inout, rings_inout, a, b, old, dying, pos)
                     if stage != old:
-                        key = postponed_key(surface_inout, rings_inout, a, b, stage, q, place.cost)
-                        size = heap_push(heap_inout, size, key, pack_pair(a, b, stage))
+                        key = postponed_key(surface_inout, rings_inout, a, b, stage, q, cost)
+                        size = queue.heap_push(heap_inout, size, key, queue.pack_pair(a, b, stage))
                     else:
                         c = vertex_count + merges
-                        commit_merge(surface_inout, rings_inout, a, b, c, q, place.pos)
+                        commit_merge(surface_inout, rings_inout, a, b, c, q, pos)
                         merge_pair_out[merges] = wp.vec2i(a, b)
                         size = push_ring(surface_inout, rings_inout, heap_inout, size, c)
                         merges += 1

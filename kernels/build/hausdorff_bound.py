@@ -258,19 +258,6 @@ def cover_queue(
 
 
 @wp.func
-def merge_rings(replay: cover.Replay, merge: wp.vec3i, near_count: int):
-    """Merge two nodes in the forest, and make the faces about the node that they make candidates; their new count."""
-    tail = absorb_ring(replay.rings, merge[0], merge[0], merge[1], merge[2], -1)
-    tail = absorb_ring(replay.rings, merge[1], merge[0], merge[1], merge[2], tail)
-    k = replay.rings.head[merge[2]]
-    while k >= 0:
-        replay.scratch.near[near_count] = k // 3
-        near_count += 1
-        k = replay.rings.next[k]
-    return near_count
-
-
-@wp.func
 def replay_merge(replay: cover.Replay, covers: cover.Covers, a: int, b: int, c: int, limit: wp.float64):
     """Merge nodes a and b into c and cover the triangles of their faces again; return the squared bound."""
     stamp = replay.counter[STAMP] + 1
@@ -281,9 +268,14 @@ def replay_merge(replay: cover.Replay, covers: cover.Covers, a: int, b: int, c: 
     near_count = int(0)
     if replay.rings.degree[a] + replay.rings.degree[b] == 2 * dying:
         near_count = third_rings(replay, a, b, stamp)
-    merge = wp.vec3i(a, b, c)
-    near_count = merge_rings(replay, merge, near_count)
-    limit = cover_queue(replay, covers, merge, queued, near_count, stamp, limit)
+    tail = absorb_ring(replay.rings, a, a, b, c, -1)
+    tail = absorb_ring(replay.rings, b, a, b, c, tail)
+    k = replay.rings.head[c]
+    while k >= 0:
+        replay.scratch.near[near_count] = k // 3
+        near_count += 1
+        k = replay.rings.next[k]
+    limit = cover_queue(replay, covers, wp.vec3i(a, b, c), queued, near_count, stamp, limit)
     replay.counter[LIVE_FACES] = replay.counter[LIVE_FACES] - dying
     replay.counter[QUEUED] = queued
     return limit

@@ -72,19 +72,8 @@ def face_distance_sq(face_pos: wp.array2d(dtype=wp.vec3d), f: int, p: wp.vec3d):
 
 
 @wp.func
-def interval_distance(p: wp.float64, lower: wp.float64, upper: wp.float64):
-    below = lower - p
-    above = p - upper
-    most = wp.where(below > above, below, above)
-    return wp.where(most > wp.float64(0.0), most, wp.float64(0.0))
-
-
-@wp.func
 def box_distance_sq(p: wp.vec3d, lower: wp.vec3d, upper: wp.vec3d):
-    x = interval_distance(p[0], lower[0], upper[0])
-    y = interval_distance(p[1], lower[1], upper[1])
-    z = interval_distance(p[2], lower[2], upper[2])
-    return x * x + y * y + z * z
+    return wp.length_sq(wp.max(wp.max(lower - p, p - upper), wp.vec3d()))
 
 
 @wp.func

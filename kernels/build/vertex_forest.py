@@ -162,53 +162,35 @@ def climb_face(corner: wp.vec3i, node_count: int, vertex_parent: wp.array(dtype=
 
 
 @wp.kernel
-def count_events_kernel(
+def find_events_kernel(
     vertex_count: int,
     node_count: int,
     face_vertex: wp.array2d(dtype=int),
     vertex_parent: wp.array(dtype=int),
-    split_size_inout: wp.array(dtype=wp.int64),
+    split_cursor_inout: wp.array(dtype=wp.int64),
     face_split_out: wp.array(dtype=int),
+    split_face_out: wp.array(dtype=int),
 ):
-    """Find the merge at which each face dies, and count the faces that every split touches (serial, dim=1).
+    """Find the merge at which each face dies, and write it to the slices of all splits that touch it (serial, dim=1).
 
     The three corners climb in the order of the merges, so the first merge that two of them share is the lowest
     common ancestor at which the face dies; every merge passed on the way deforms the face.
+
+    Args:
+        split_cursor_inout: Start of every slice, which come out ascending, shape [m]; ends as the end of every slice.
+        split_face_out: Slices; shape [0] only counts the faces of each.
     """
-    merge_count = node_count - vertex_count
     for f in range(face_vertex.shape[0]):
         corner = face_corners(face_vertex, f)
         alive = are_distinct(corner)
-        split = wp.where(alive, 0, merge_count + 1)
+        split = wp.where(alive, 0, node_count - vertex_count + 1)
         while alive:
             node, corner, alive = climb_face(corner, node_count, vertex_parent)
             if node < node_count:
                 i = node_count - 1 - node
-                split_size_inout[i] = split_size_inout[i] + wp.int64(1)
+                if split_face_out.shape[0] > 0:
+                    split_face_out[split_cursor_inout[i]] = f
+                split_cursor_inout[i] = split_cursor_inout[i] + wp.int64(1)
                 if not alive:
                     split = i + 1
         face_split_out[f] = split
-
-
-@wp.kernel
-def fill_events_kernel(
-    node_count: int,
-    face_vertex: wp.array2d(dtype=int),
-    vertex_parent: wp.array(dtype=int),
-    split_cursor_inout: wp.array(dtype=wp.int64),
-    split_face_out: wp.array(dtype=int),
-):
-    """Write every face to the slices of the splits that touch it (serial, dim=1: each slice comes out ascending).
-
-    Args:
-        split_cursor_inout: Start of every slice, shape [m]; ends as the end of every slice.
-    """
-    for f in range(face_vertex.shape[0]):
-        corner = face_corners(face_vertex, f)
-        alive = are_distinct(corner)
-        while alive:
-            node, corner, alive = climb_face(corner, node_count, vertex_parent)
-            if node < node_count:
-                i = node_count - 1 - node
-                split_face_out[split_cursor_inout[i]] = f
-                split_cursor_inout[i] = split_cursor_inout[i] + wp.int64(1)

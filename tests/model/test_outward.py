@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from oracles.distance import brute_distances, exact_distance_sq, farthest_distance, lattice_points
 
 import warp_abtree as ab
-from warp_abtree.model.outward_error import OutwardError
+from warp_abtree.model.lod_bounds import OutwardError
 
 FUZZ = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
 

@@ -14,8 +14,8 @@ from oracles.distance import brute_distances, farthest_points
 
 from warp_abtree import testing
 from warp_abtree.model import collapse, lod_bounds
+from warp_abtree.model.lod_bounds import OutwardError
 from warp_abtree.model.mesh import describe_mesh, load_mesh, mesh_from_arrays
-from warp_abtree.model.outward_error import OutwardError
 from warp_abtree.model.progressive import build_progressive
 from warp_abtree.model.tree import active_build
 

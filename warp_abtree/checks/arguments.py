@@ -1,8 +1,6 @@
 """Checks of what a caller hands in: one clear error that names what and where, before anything is changed."""
 
-import inspect
 import os
-import warnings
 
 import numpy as np
 import warp as wp
@@ -107,14 +105,6 @@ def to_numpy(values, what: str) -> np.ndarray:
 def first_line(error) -> str:
     """Return the first line of an error's text, or its type where it has none."""
     return next(iter(str(error).splitlines()), "") or type(error).__name__
-
-
-def warn_caller(message: str, category: type[Warning] = RuntimeWarning):
-    """Warn at the line that called the library."""
-    frame, level = inspect.currentframe(), 1
-    while frame is not None and frame.f_globals.get("__name__", "").startswith("warp_abtree."):
-        frame, level = frame.f_back, level + 1
-    warnings.warn(message, category, stacklevel=level)
 
 
 def whole_number(value, what: str, low: int, high: int) -> int:

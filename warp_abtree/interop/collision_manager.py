@@ -223,7 +223,7 @@ class CollisionManager(DeviceMemory):
             ValueError: No object has a name, a transform is not rigid within 1e-6, or turns by half a revolution.
         """
         names, own = self._own()
-        ends = self._placed.poses[: self._placed.scene.object_count].copy()
+        ends = np.array(self._placed.poses[: self._placed.scene.object_count]).reshape(-1, 4, 4)
         for name, transform in transforms.items():
             ends[self._slot(name)] = self._matrix(transform, name)
         _, at_first = self.in_collision_internal(return_names=True)

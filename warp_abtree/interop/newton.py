@@ -168,9 +168,9 @@ class NewtonContacts(DeviceMemory):
         self.others: Any = None
         reach = np.zeros((len(found), 4))
         reach[:, 3] = (model.shape_margin.numpy() + model.shape_gap.numpy())[found]
-        if not (np.isfinite(reach).all() and (reach >= 0).all()):
-            bad = found[np.flatnonzero(~(np.isfinite(reach[:, 3]) & (reach[:, 3] >= 0)))[0]]
-            raise ValueError(f"gap: margin and gap of shape {bad} make no finite distance of 0 or more")
+        bad = found[~(np.isfinite(reach[:, 3]) & (reach[:, 3] >= 0))]
+        if len(bad):
+            raise ValueError(f"gap: margin and gap of shape {bad[0]} make no finite distance of 0 or more")
         self._ids = wp.array(self.shapes, dtype=wp.int32, device=self.device)
         self._no_body = wp.empty(0, dtype=wp.transform, device=self.device)
         self._keep_settings()
@@ -187,13 +187,13 @@ class NewtonContacts(DeviceMemory):
             source = self.model.shape_source[shape]
             if getattr(source, "enable_surface_velocity", False):
                 raise ValueError(f"the surface of shape {shape} moves (enable_surface_velocity): not supported")
-            key = (id(source), tuple(scale[shape].tolist()))
-            if given.get(shape) is None and key not in known:
+            key, own = (id(source), tuple(scale[shape].tolist())), given.get(shape)
+            if own is None and key not in known:
                 vertices = np.asarray(source.vertices, np.float64) * scale[shape]
                 faces = np.asarray(source.indices).reshape(-1, 3)
                 faces = keep_outside(faces, np.diag(scale[shape]))
                 known[key] = Model.from_arrays(vertices, faces, name=f"shape {shape}")
-            models.append(known[key] if given.get(shape) is None else given[shape])
+            models.append(known[key] if own is None else own)
         return models
 
     def _keep_settings(self):
@@ -204,16 +204,19 @@ class NewtonContacts(DeviceMemory):
         own[self.shapes] = 1
         self._is_own = wp.array(own, dtype=wp.int32, device=self.device)
         self._changed = wp.full(1, len(own), dtype=wp.int32, device=self.device)
-        self._kept = kernels.ShapeSettings()
+        self._kept = self._settings(wp.clone)
+
+    def _settings(self, take=lambda array: array):
+        """Return what `take` makes of the settings of all shapes."""
+        made = kernels.ShapeSettings()
         for name in SETTINGS:
-            setattr(self._kept, name, wp.clone(getattr(self.model, f"shape_{name}")))
+            setattr(made, name, take(getattr(self.model, f"shape_{name}")))
+        return made
 
     def _refuse_changes(self):
         """Raise where settings are others than they were. Waits for the device."""
         # Not within `launch`: a graph would go on with arrays that others have replaced.
-        now = kernels.ShapeSettings()
-        for name in SETTINGS:
-            setattr(now, name, getattr(self.model, f"shape_{name}"))
+        now = self._settings()
         inputs = [int(self.newton.ShapeFlags.COLLIDE_SHAPES), self._is_own, self._kept, now, self._changed]
         wp.launch(kernels.find_changed_kernel, len(self._is_own), inputs, device=self.device)
         what, shape = "", int(self._changed.numpy()[0])
@@ -237,9 +240,10 @@ class NewtonContacts(DeviceMemory):
 
     def contacts(self, rigid_contact_max=None):
         """Return an empty `newton.Contacts`; by default with room for all points of each pair."""
-        room = self.query.point_max * len(self.query.pairs)
-        room += POINTS_MAX * min(len(self._pairs_of_others), OTHERS_MAX)
-        room = room if rigid_contact_max is None else rigid_contact_max
+        room = rigid_contact_max
+        if room is None:
+            others = min(len(self._pairs_of_others), OTHERS_MAX)
+            room = self.query.point_max * len(self.query.pairs) + POINTS_MAX * others
         if not self._has_others:
             return self.newton.Contacts(room, 0, device=self.device)
         self._make_others(room)

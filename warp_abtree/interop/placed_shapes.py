@@ -61,13 +61,13 @@ class PlacedShapes:
     Attributes:
         scene: `Scene` with one object per slot; closed shapes are solids where asked.
         shapes: `Shape` of each slot.
-        poses: Matrices of the slots [world units], float64 (at least as many as slots, 4, 4).
+        poses: Matrix of each slot [world units], float64 (4, 4).
     """
 
     def __init__(self, device, solids: bool):
         self.scene, self._solids = Scene(device), solids
         self.shapes: list[Shape] = []
-        self.poses = np.tile(np.eye(4), (8, 1, 1))
+        self.poses: list[np.ndarray] = []
         self._free: dict[Shape, list[int]] = {}
         self._moved = False
 
@@ -77,10 +77,8 @@ class PlacedShapes:
             slot = self._free[shape].pop()
         else:
             slot = self.scene.object_count
-            if slot == len(self.poses):
-                self.poses = np.concatenate([self.poses, np.tile(np.eye(4), (slot, 1, 1))])
             # First, so that an interruption leaves no object without a shape.
-            self.shapes[slot:] = [shape]
+            self.poses[slot:], self.shapes[slot:] = [matrix], [shape]
             self.scene.add(shape.model, matrix, solid=self._solids and shape.is_closed)
         self.move(slot, matrix)
         return slot
@@ -101,12 +99,12 @@ class PlacedShapes:
     def upload(self):
         """Copy poses that have changed to the device."""
         if self._moved:
-            self.scene.set_poses(self.poses[: self.scene.object_count])
+            self.scene.set_poses(np.array(self.poses[: self.scene.object_count]))
             self._moved = False
 
     def boxes(self):
         """Return centres and half extents of all boxes in the world, (n, 3) each, rounded outwards."""
-        poses = self.poses[: len(self.shapes)]
+        poses = np.array(self.poses[: len(self.shapes)]).reshape(-1, 4, 4)
         middle, half = np.array([(shape.middle, shape.half) for shape in self.shapes]).reshape(-1, 2, 3).swapaxes(0, 1)
         rotation, position = poses[:, :3, :3], poses[:, :3, 3]
         size = np.linalg.norm(middle, axis=1) + np.linalg.norm(half, axis=1)

@@ -145,10 +145,8 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
             continue
         model, lod = scene.models[scene.object_model[i]], int(scene.lods[i])
         vertices, faces, face_ids = model.mesh_at(lod)
-        geometry, colours = (
-            f"model {scene.object_model[i]} {model.name} at LOD {lod}",
-            np.tile(colour, (len(vertices), 1)),
-        )
+        geometry = f"model {scene.object_model[i]} {model.name} at LOD {lod}"
+        colours = np.tile(colour, (len(vertices), 1))
         if i in hit:
             red = np.isin(face_ids, hit[i]) if hit[i] is not None else np.ones(len(faces), bool)
             # glTF has colours per vertex: faces of two colours must not share any.

@@ -1,10 +1,13 @@
-"""Certified errors of all LODs: a replay of the collapse sequence, beside it or afterwards."""
+"""Certified errors of LODs: inward ones by a replay of the collapse, beside it or later, outward ones on demand."""
+
+from functools import cached_property
 
 import numpy as np
 import warp as wp
 
 from warp_abtree.checks.kernel_loading import loading
-from warp_abtree.kernels.build import hausdorff_bound, polygon, triangle_cover
+from warp_abtree.checks.upload import struct_of
+from warp_abtree.kernels.build import hausdorff_bound, outward_bound, polygon, triangle_cover
 from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, unwritten
 
 # Triangles covered per launch, about.
@@ -14,7 +17,8 @@ SLOTS_PER_FACE, SLOTS_EXTRA = 3, 4096
 
 # Error of a bound by rounding, in units of the frame (coordinates about 1/2, so 2^-54 each): reading the vertices of
 # both surfaces, a closest point of some ten operations, and the points of at most 64 cuts by three planes each, every
-# one within 2^-52 a coordinate of the segment that it cuts: 192 sqrt(3) 2^-52 and a little, under 2^-43.
+# one within 2^-52 a coordinate of the segment that it cuts: 192 sqrt(3) 2^-52 and a little, under 2^-43. The parts of a
+# face that outward bounds cut cover it up to the same distance, after 192 nested cuts.
 ROUNDING = 2.0**-43
 
 # With the threads of a block, as `loading` takes them.
@@ -116,3 +120,63 @@ def _index(replay):
     lower, upper = corners.min(axis=1).astype(np.float32), corners.max(axis=1).astype(np.float32)
     replay.bvh_face = cpu_array(active, int)
     return wp.Bvh(cpu_array(lower, wp.vec3), cpu_array(upper, wp.vec3))
+
+
+class OutwardError:
+    """Bounds on the distance of any point of the surface at a LOD from the original surface, computed on demand.
+
+    Caches its results and, from the first call on, about 120 bytes for each face of the original; neither is pickled.
+    """
+
+    def __init__(self, progressive, tree):
+        self.progressive, self.tree = progressive, tree
+        self._found: dict[int, float] = {}
+
+    def __getstate__(self):
+        return {"progressive": self.progressive, "tree": self.tree, "_found": {}}
+
+    def at(self, lod: int) -> float:
+        """Return the bound [model units] at a LOD; 0 where every active face lies where it does in the original."""
+        if lod not in self._found:
+            self._found[lod] = self._bound(lod)
+        return self._found[lod]
+
+    def _bound(self, lod):
+        progressive = self.progressive
+        vertices, faces, face_ids = progressive.mesh_at(lod)
+        moved = (vertices[faces] != progressive.vertex_pos[progressive.face_vertex[face_ids]]).any((1, 2))
+        if not moved.any():
+            return 0.0
+        faces, face_ids = faces[moved], face_ids[moved]
+        centre, scale, original = self._index
+        vertices = (vertices - centre) / scale
+        corner = vertices[faces]
+        # Corners and middles first: a face whose bound is below their greatest distance is not cut.
+        used, first = np.unique(faces, return_index=True)
+        point = np.concatenate([vertices[used], corner.mean(1)])
+        guess = np.concatenate([face_ids[first // 3], face_ids])
+        distance_sq = wp.zeros(len(point), dtype=wp.float64, device="cpu")
+        inputs = [cpu_array(point, wp.vec3d), cpu_array(guess, int), original, distance_sq]
+        wp.launch(outward_bound.measure_points_kernel, dim=len(point), inputs=inputs, device="cpu")
+        bound_sq = wp.zeros(len(corner), dtype=wp.float64, device="cpu")
+        inputs = [float(distance_sq.numpy().max()), cpu_array(corner, wp.vec3d), cpu_array(face_ids, int), original]
+        rows = outward_bound.ROWS
+        inputs += [make_scratch(1, 1, rows), wp.zeros(rows, dtype=int, device="cpu"), bound_sq]
+        wp.launch(outward_bound.bound_faces_kernel, dim=1, inputs=inputs, device="cpu")
+        # ROUNDING is of coordinates up to 1/2; merged vertices may lie outside the box of the original ones.
+        reach = max(1.0, 2 * float(np.abs(point).max()))
+        return float(scale * (np.sqrt(bound_sq.numpy().max()) + ROUNDING * reach))
+
+    @cached_property
+    def _index(self):
+        """Return the frame, and in it the original faces with a box for each node of the tree."""
+        progressive, tree = self.progressive, self.tree
+        centre, scale = find_frame(progressive.vertex_pos[: progressive.vertex_count])
+        corner = (progressive.vertex_pos[progressive.face_vertex] - centre) / scale
+        there = progressive.face_split <= progressive.lod_max
+        # the next float32, whichever way the conversion rounded
+        lower = np.nextafter(corner[there].min(1).astype(np.float32), np.float32(-np.inf))
+        upper = np.nextafter(corner[there].max(1).astype(np.float32), np.float32(np.inf))
+        lower, upper = tree.node_boxes(there, lower, upper)
+        boxes = {"node_lower": lower, "node_upper": upper, "node_face": tree.node_face}
+        return centre, scale, struct_of(outward_bound.Original, "cpu", face_pos=corner, **boxes)

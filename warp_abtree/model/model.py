@@ -16,8 +16,8 @@ from warp_abtree.kernels.base.poses import COORDINATE_MIN
 from warp_abtree.model.cache import LEAST_FACES, error_key, file_key, find_model, keep_errors, keep_model, mesh_key
 from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.files.unpack import exceeds_limit, limit_message
+from warp_abtree.model.lod_bounds import OutwardError
 from warp_abtree.model.mesh import COORDINATE_MAX, EXTENT_LIMITS, Mesh, load_mesh, mesh_from_arrays, orient_mesh
-from warp_abtree.model.outward_error import OutwardError
 from warp_abtree.model.progressive import ProgressiveMesh, build_progressive
 from warp_abtree.model.tree import Tree, active_build
 from warp_abtree.model.winding import Winding, find_winding

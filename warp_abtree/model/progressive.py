@@ -25,7 +25,7 @@ NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
 KERNELS = [
     (collapse_kernels.collapse_edges_kernel, 1),
     (active_build.split_segment_kernel, 1),
-    (vertex_forest.fill_events_kernel, 1),
+    (vertex_forest.find_events_kernel, 1),
 ]
 _certifying = threading.Lock()  # each takes all cores
 
@@ -209,14 +209,12 @@ def _follow(collapse, bounds, report):
 
 def _splits(parent, faces, vertex_count):
     """Return face_split int32 [n_f], split_start int64 [m+1] and split_face int32 of a forest."""
-    node_count = len(parent)
-    merge_count = node_count - vertex_count
-    face_array, parent_array = cpu_array(faces, int), cpu_array(parent, int)
-    size = wp.zeros(merge_count + 1, dtype=wp.int64, device="cpu")
+    merge_count = len(parent) - vertex_count
+    given = vertex_count, len(parent), cpu_array(faces, int), cpu_array(parent, int)
     face_split = wp.zeros(len(faces), dtype=int, device="cpu")
-    launch(vertex_forest.count_events_kernel, vertex_count, node_count, face_array, parent_array, size, face_split)
+    size = wp.zeros(merge_count + 1, dtype=wp.int64, device="cpu")
+    launch(vertex_forest.find_events_kernel, *given, size, face_split, None)
     split_start = np.concatenate([[0], np.cumsum(size.numpy()[:merge_count])]).astype(np.int64)
     split_face = wp.zeros(int(split_start[-1]), dtype=int, device="cpu")
-    cursor = cpu_array(split_start.copy(), wp.int64)
-    launch(vertex_forest.fill_events_kernel, node_count, face_array, parent_array, cursor, split_face)
+    launch(vertex_forest.find_events_kernel, *given, cpu_array(split_start.copy(), wp.int64), face_split, split_face)
     return face_split.numpy(), split_start, split_face.numpy()

@@ -145,10 +145,8 @@ class RigidBodies(DeviceMemory):
     def _first_reach(self, velocity, angular_velocity, radii):
         """Return how far ahead contacts of the first step are looked for, as if it took FIRST_STEP, (n, 4)."""
         radius = np.where(self.rigid, radii, 0.0)
-        turn, most = (
-            FIRST_STEP * np.linalg.norm(angular_velocity, axis=1) * radius,
-            float(kernels.LOOKAHEAD_MAX) * radius,
-        )
+        turn = FIRST_STEP * np.linalg.norm(angular_velocity, axis=1) * radius
+        most = float(kernels.LOOKAHEAD_MAX) * radius
         motion = FIRST_STEP * np.where(self.rigid[:, None], velocity, 0.0)
         length = np.maximum(np.linalg.norm(motion, axis=1), 1e-300)
         reach = np.minimum(turn, most) + float(kernels.LOOKAHEAD_LEAST) * radius

@@ -82,9 +82,8 @@ def check_output(path, suffixes, inputs=(), make=False):
         raise ValueError(f"{path}: the name must end in {' or '.join(suffixes)}")
     folder = path.parent.parent if make and not path.parent.exists() else path.parent
     if not folder.is_dir():
-        raise ValueError(
-            f"{path}: {folder} is no folder" if folder.exists() else f"{path}: there is no folder {folder}"
-        )
+        told = f"{folder} is no folder" if folder.exists() else f"there is no folder {folder}"
+        raise ValueError(f"{path}: {told}")
     if path.is_dir():
         raise ValueError(f"{path}: is a folder")
     if is_special(path):

@@ -10,7 +10,7 @@ import trimesh
 
 from warp_abtree.app.toml.errors import fail
 from warp_abtree.app.toml.shapes import FACE_BOUNDS, GENERATED
-from warp_abtree.checks.arguments import warn_caller
+from warp_abtree.model.files.found import warn_caller
 from warp_abtree.model.mesh import Mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line, warn_caller
+from warp_abtree.checks.arguments import first_line
 from warp_abtree.interop.robot.description import (
     Description,
     Part,
@@ -17,7 +17,7 @@ from warp_abtree.interop.robot.description import (
     unit_axis,
 )
 from warp_abtree.interop.robot.urdf import INSTALL
-from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
+from warp_abtree.model.files.found import FileSurface, MeshError, Remarks, warn_caller
 from warp_abtree.model.files.read import read_file, split_file_name
 
 MJCF_JOINTS = {"hinge": "revolute", "slide": "prismatic"}
@@ -208,10 +208,8 @@ def _shape(mujoco, model, g, where):
         made = trimesh.creation.capsule(radius=size[0], height=2 * size[1])
         made.apply_translation(-made.bounds.mean(0))
     else:
-        raise RobotError(
-            f"{where}: geom {model.geom(g).name or g!r} is a {kind}, which has no mesh; what surrounds the robot is "
-            "given to Robot.check"
-        )
+        told = f"{where}: geom {model.geom(g).name or g!r} is a {kind}, which has no mesh"
+        raise RobotError(f"{told}; what surrounds the robot is given to Robot.check")
     return np.asarray(made.vertices), np.asarray(made.faces)
 
 

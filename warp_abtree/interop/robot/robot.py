@@ -9,21 +9,14 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import (
-    check_device,
-    flag,
-    is_device_array,
-    to_numpy,
-    warn_caller,
-    whole_number,
-    wrap_array,
-)
+from warp_abtree.checks.arguments import check_device, flag, is_device_array, to_numpy, whole_number, wrap_array
 from warp_abtree.interop.robot.check import RobotQuery, check_edges
 from warp_abtree.interop.robot.description import Description, RobotError
 from warp_abtree.interop.robot.mjcf import read_mjcf
 from warp_abtree.interop.robot.surroundings import make_surroundings
 from warp_abtree.interop.robot.urdf import apply_srdf, read_urdf
 from warp_abtree.kernels.robot import forward
+from warp_abtree.model.files.found import warn_caller
 from warp_abtree.model.model import Model
 from warp_abtree.query.stages.distance import check_beyond
 from warp_abtree.scene.scene import Scene
@@ -170,11 +163,9 @@ class Robot:
         """
         check_device(self.device, "Robot.forward")
         rows = self._take(configurations, limits)
-        frames = forward.Frames()
-        shape = len(rows), len(self.description.frames)
-        frames.rotation, frames.position = (
-            wp.empty(shape, dtype=dtype, device=self.device) for dtype in (wp.mat33d, wp.vec3d)
-        )
+        frames, shape = forward.Frames(), (len(rows), len(self.description.frames))
+        frames.rotation = wp.empty(shape, dtype=wp.mat33d, device=self.device)
+        frames.position = wp.empty(shape, dtype=wp.vec3d, device=self.device)
         poses = wp.empty((len(rows), len(self._links)), dtype=wp.mat44d, device=self.device)
         if len(rows):
             wp.launch(forward.forward_kernel, len(rows), [self._chain, rows, frames], device=self.device)

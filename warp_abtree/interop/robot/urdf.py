@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line, warn_caller
+from warp_abtree.checks.arguments import first_line
 from warp_abtree.interop.robot.description import (
     Description,
     Part,
@@ -21,6 +21,7 @@ from warp_abtree.interop.robot.description import (
     join_meshes,
     unit_axis,
 )
+from warp_abtree.model.files.found import warn_caller
 from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.mesh import MeshError, load_mesh
 
@@ -97,10 +98,8 @@ def _limits(joint, path) -> tuple[float, float]:
         return -math.inf, math.inf
     given = (None, None) if joint.limit is None else (joint.limit.lower, joint.limit.upper)
     if given == (None, None):
-        raise RobotError(
-            f"{path}: joint {joint.name!r} is {joint.type} and has no limits; give <limit lower=... upper=...>"
-            + (", or make it continuous" if joint.type == "revolute" else "")
-        )
+        told = f"{path}: joint {joint.name!r} is {joint.type} and has no limits; give <limit lower=... upper=...>"
+        raise RobotError(told + (", or make it continuous" if joint.type == "revolute" else ""))
     low, high = (0.0 if value is None else float(value) for value in given)
     if not low <= high:
         raise RobotError(f"{path}: joint {joint.name!r}: limits {low:g} .. {high:g} leave no value")
@@ -272,9 +271,8 @@ def apply_srdf(description: Description, path: Path, strict: bool):
                 raise RobotError(f"{path}: a {tag} without {attributes[names.index('')]}")
             missing = [name for name in names if name not in description.links]
             if missing and strict:
-                raise RobotError(
-                    f"{path}: {tag} names {missing[0]!r}, which is no link of the robot (strict=False goes on)"
-                )
+                told = f"{tag} names {missing[0]!r}, which is no link of the robot"
+                raise RobotError(f"{path}: {told} (strict=False goes on)")
             unknown.update(dict.fromkeys(missing))
             pairs.append(frozenset(names))
         return pairs

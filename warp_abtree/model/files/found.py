@@ -1,16 +1,24 @@
 """Surfaces that readers of mesh files return, their remarks, and the error that they raise."""
 
+import inspect
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
-
-from warp_abtree.checks.arguments import warn_caller
 
 NAMED = 4  # things that a warning lists by name
 
 
 class MeshError(ValueError):
     """Say in one line what is wrong with a mesh, and where."""
+
+
+def warn_caller(message: str, category: type[Warning] = RuntimeWarning):
+    """Warn at the line that called the library."""
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and frame.f_globals.get("__name__", "").startswith("warp_abtree."):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)
 
 
 class Remarks:
