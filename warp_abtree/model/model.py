@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line, warn_caller, whole_number
+from warp_abtree.checks.arguments import first_line, whole_number
 from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.kernels.base.poses import COORDINATE_MIN
 from warp_abtree.model.cache import LEAST_FACES, error_key, file_key, find_model, keep_errors, keep_model, mesh_key
+from warp_abtree.model.files.found import warn_caller
 from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.files.unpack import exceeds_limit, limit_message
 from warp_abtree.model.lod_bounds import OutwardError

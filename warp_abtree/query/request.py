@@ -11,7 +11,7 @@ from warp_abtree.kernels.intersect import face_pairs
 OUTPUTS = {"any": face_pairs.OUTPUT_ANY, "count": face_pairs.OUTPUT_COUNT, "faces": face_pairs.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.EXACT, "float32": predicates.FLOAT32}
 
-PRECISION_NAMES = tuple(PRECISIONS)  # found without a hash
+_PRECISION_NAMES = tuple(PRECISIONS)  # found without a hash
 
 # Options that each output takes beside precision: in a scene, in a sweep, in a sweep of motions; and all of each.
 _HITS, _DISTANCE = ("within",), ("tolerance", "relative", "beyond", "signed", "originals")
@@ -77,7 +77,7 @@ def check_request(output: str, precision: str):
     """
     if output not in (*OUTPUTS, "contacts", "distance"):
         raise ValueError(f"output {output!r} is none of 'any', 'count', 'faces', 'contacts', 'distance'")
-    if precision not in PRECISION_NAMES:
+    if precision not in _PRECISION_NAMES:
         raise ValueError(f"precision {precision!r} is neither 'exact' nor 'float32'")
     others = {"contacts": "ContactQuery", "distance": "DistanceQuery"}
     if output in others:
@@ -104,7 +104,7 @@ def check_options(caller: str, taken: dict, output: str, precision: str, options
     for name in given:
         if name not in taken[output]:
             raise ValueError(f"{name} means nothing for output {output!r}")
-    if precision not in PRECISION_NAMES:
+    if precision not in _PRECISION_NAMES:
         check_request("faces", precision)
     return given
 

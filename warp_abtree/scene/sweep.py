@@ -4,9 +4,9 @@ What a pair of models needs on a device is kept for the next call. Poses pass th
 buffer slots: while a GPU works on a chunk, the previous one is read and the next one uploaded.
 """
 
-import functools
 import weakref
 from collections import deque
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,7 +15,6 @@ from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.base.arrays import NONE_REFUSED
 from warp_abtree.kernels.io.sweep import pose_placer, report_chunk_kernel
-from warp_abtree.query.operator import Operator
 from warp_abtree.query.request import MOTION_OPTIONS, SWEEP_OPTIONS, check_options, check_within, refuse_signed
 from warp_abtree.query.stages.distance import DistanceQuery, check_beyond, check_distance_options
 from warp_abtree.query.stages.first_contact import FirstContactQuery
@@ -37,6 +36,7 @@ POSE_TOLERANCE = {7: QUATERNION_TOLERANCE, 16: RIGID_TOLERANCE}
 DISTANCE_ROWS = np.dtype(
     [("distance", np.float64), ("bracket", np.float64, 2), ("points", np.float64, (2, 3)), ("faces", np.int32, 2)]
 )
+RESULT_NAMES = {"faces": "point_faces"}  # of `Result`, where a row's name is another
 CONTACT_ROWS = np.dtype([("time", np.float64), ("clear", bool), ("undecided", bool)])
 PACKED_DTYPES = {"any": np.dtype(bool), "count": np.dtype(np.int64)}
 
@@ -95,7 +95,7 @@ class _ChunkQuery:
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
         if self.output == "distance":
-            self.query: Operator = DistanceQuery(chunk.batch, self.pairs, signed=signed)
+            self.query: Any = DistanceQuery(chunk.batch, self.pairs, signed=signed)
         elif self.output == "first_contact":
             self.query = FirstContactQuery(chunk.batch, None, self.pairs, linear=precision == "linear")
         else:
@@ -199,67 +199,37 @@ class _ChunkQuery:
             raise
         return answers
 
-    def _ask(self, poses, run):
-        """Yield the poses of each chunk, a slice, and what `run` finds of the chunk's first so many pairs."""
-        slot = self._find_slots(poses)[0]
+    def _ask(self, poses, ends=None, **distances):
+        """Yield the poses of each chunk, a slice, and what the query finds of the chunk's first so many pairs."""
+        given = [(poses, None, "poses")]
+        if ends is not None:
+            given.append((ends, self.query.ends, "end_poses"))
         for start in range(0, len(poses), self.room):
             self.count = count = min(self.room, len(poses) - start)
-            self._load(slot, poses, start, count)
-            self._place(slot)
-            result = run(self.pairs[:count])
-            refused = int(slot.report.numpy()[0])
-            if refused != NONE_REFUSED:
-                refuse_row(poses, start + refused)
-            yield slice(start, start + count), result
-
-    def _run(self, pairs, **distances):
-        self.query.ask_pairs(pairs, **distances)
-        return self.query.run()
-
-    def find_faces(self, poses):
-        """Return the rows of "faces" of all poses."""
-        parts = []
-        for part, result in self._ask(poses, self._run):
-            result.faces[:, 0] += part.start
-            parts.append(result.faces)
-        return np.concatenate(parts)
-
-    def find_apart(self, poses, within):
-        """Return the rows of "any" or "count" of all poses, and which are proved farther apart."""
-        found = np.empty(len(poses), apart_rows(self.output))
-        for part, result in self._ask(poses, functools.partial(self._run, within=within)):
-            found[self.output][part], found["apart"][part] = getattr(result, self.output), result.apart
-        return found
-
-    def find_distances(self, poses, tolerances, beyond):
-        """Return the rows of "distance" of all poses."""
-        assert isinstance(self.query, DistanceQuery)
-        self.query.set_tolerance(**tolerances)
-        run = functools.partial(self._run, beyond=beyond)
-        found = np.empty(len(poses), DISTANCE_ROWS)
-        for part, result in self._ask(poses, run):
-            rows = found[part]
-            rows["distance"], rows["bracket"] = result.distance, result.bracket
-            rows["points"], rows["faces"] = result.points, result.point_faces
-        return found
-
-    def find_first_contacts(self, poses, ends, options):
-        """Return the rows of "first_contact" of all motions, from poses to ends."""
-        assert isinstance(self.query, FirstContactQuery)
-        self.query.set_options(**options)
-        found = np.empty(len(poses), CONTACT_ROWS)
-        for start in range(0, len(poses), self.room):
-            self.count = count = min(self.room, len(poses) - start)
-            for rows, objects, what in ((poses, None, "poses"), (ends, self.query.ends, "end_poses")):
+            for rows, objects, what in given:
                 slot = self._find_slots(rows)[0]
                 self._load(slot, rows, start, count)
                 self._place(slot, objects)
                 refused = int(slot.report.numpy()[0])
                 if refused != NONE_REFUSED:
                     refuse_row(rows, start + refused, what)
-            result = self._run(self.pairs[:count])
-            for name in ("time", "clear", "undecided"):
-                found[name][start : start + count] = getattr(result, name)
+            self.query.ask_pairs(self.pairs[:count], **distances)
+            yield slice(start, start + count), self.query.run()
+
+    def find_faces(self, poses):
+        """Return the rows of "faces" of all poses."""
+        parts = []
+        for part, result in self._ask(poses):
+            result.faces[:, 0] += part.start
+            parts.append(result.faces)
+        return np.concatenate(parts)
+
+    def find_rows(self, poses, kind, ends=None, **distances):
+        """Return rows of all poses, each field the array of a result that has its name."""
+        found = np.empty(len(poses), kind)
+        for part, result in self._ask(poses, ends, **distances):
+            for name in kind.names:
+                found[name][part] = getattr(result, RESULT_NAMES.get(name, name))
         return found
 
     def is_small(self):
@@ -374,12 +344,14 @@ def _sweep(pair, poses, asked, options):
     chunk = posed.find_chunk(len(poses))
     query = chunk.find_query(output, precision, options.get("signed", False), within is not None)
     if output == "distance":
-        tolerances = {name: options[name] for name in ("tolerance", "relative") if name in options}
-        answers = query.find_distances(poses, tolerances, check_beyond(options.get("beyond")))
+        query.query.set_tolerance(**{name: options[name] for name in ("tolerance", "relative") if name in options})
+        answers = query.find_rows(poses, DISTANCE_ROWS, beyond=check_beyond(options.get("beyond")))
     elif output == "first_contact":
-        answers = query.find_first_contacts(poses, options.pop("end_poses"), options)
+        ends = options.pop("end_poses")
+        query.query.set_options(**options)
+        answers = query.find_rows(poses, CONTACT_ROWS, ends)
     elif within is not None:
-        answers = query.find_apart(poses, within)
+        answers = query.find_rows(poses, apart_rows(output), within=within)
     else:
         answers = query.find_faces(poses) if output == "faces" else query.find_answers(poses)
     chunk.trim()
