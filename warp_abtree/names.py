@@ -10,13 +10,13 @@ from warp_abtree.lod.controllers import Feedback, PaperController, PredictiveCon
 from warp_abtree.lod.view import Camera
 from warp_abtree.model.mesh import MeshError
 from warp_abtree.model.model import Model, ModelError
-from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.distance import DistanceQuery
-from warp_abtree.query.manifold import ManifoldQuery
-from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import Buffers, CapacityError
 from warp_abtree.query.result import Result
-from warp_abtree.scene.first_contact import FirstContactQuery
+from warp_abtree.query.stages.contacts import ContactQuery
+from warp_abtree.query.stages.distance import DistanceQuery
+from warp_abtree.query.stages.first_contact import FirstContactQuery
+from warp_abtree.query.stages.intersect import Query
+from warp_abtree.query.stages.points import ManifoldQuery
 from warp_abtree.scene.pipeline import Pipeline
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep import sweep

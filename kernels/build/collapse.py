@@ -6,9 +6,26 @@ Source: Garland and Heckbert, "Surface simplification using quadric error metric
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.build.heap import Heap, heap_drop_top, heap_push, pack_pair, pair_first, pair_second, pair_stage, sift_down
+from warp_abtree.kernels.build.heap import (
+    Heap,
+    heap_drop_top,
+    heap_push,
+    pack_pair,
+    pair_first,
+    pair_second,
+    pair_stage,
+    sift_down,
+)
 from warp_abtree.kernels.build.quadric import Quadric, quadric_error, quadric_minimum, quadric_moved, quadric_plane
-from warp_abtree.kernels.build.vertex_forest import Rings, absorb_ring, are_distinct, count_dying, face_corners, third_corner, third_vertices_live
+from warp_abtree.kernels.build.vertex_forest import (
+    Rings,
+    absorb_ring,
+    are_distinct,
+    count_dying,
+    face_corners,
+    third_corner,
+    third_vertices_live,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -161,7 +178,6 @@ def weigh_faces_kernel(
     face_count: int,
     face_vertex: wp.array2d(dtype=int),
     boundary: wp.array2d(dtype=wp.int8),
-    # In and out:
     surface_inout: Surface,
 ):
     """Add every face's planes to the quadrics of its corners (serial, dim=1).
@@ -200,7 +216,6 @@ def price_edges_kernel(
     edge_count: int,
     edge_pair: wp.array(dtype=wp.int64),
     surface: Surface,
-    # Out:
     key_out: wp.array(dtype=wp.float64),
 ):
     """Price every edge of the original mesh (serial, dim=1).
@@ -218,7 +233,6 @@ def price_edges_kernel(
 @wp.kernel
 def compact_heap_kernel(
     surface: Surface,
-    # In and out:
     heap_inout: Heap,
     counter_inout: wp.array(dtype=int),
 ):
@@ -268,12 +282,10 @@ def collapse_edges_kernel(
     base_faces: int,
     merge_budget: int,
     heap_capacity: int,
-    # In and out:
     surface_inout: Surface,
     rings_inout: Rings,
     heap_inout: Heap,
     counter_inout: wp.array(dtype=int),
-    # Out:
     merge_pair_out: wp.array(dtype=wp.vec2i),
 ):
     """Merge the cheapest edge repeatedly (serial, dim=1); counter[STATUS] says why the launch ended.

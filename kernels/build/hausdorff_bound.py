@@ -7,7 +7,7 @@ other faces and by those around the merge.
 
 import warp as wp
 
-from warp_abtree.kernels.build.triangle_cover import COVERS_AT_ONCE, Covers, FLOOR, Replay, SLOTS, SLOT_FACE, SLOT_LAST, SLOT_NEXT, SLOT_SIBLING, SLOT_STAMP, SLOT_TRIANGLE, add_near, add_ring, cover_distance_sq, cover_ring, cover_triangle, fetch_merge, place_face
+from warp_abtree.kernels.build import triangle_cover as cover
 from warp_abtree.kernels.build.vertex_forest import absorb_ring, count_dying, third_corner, third_vertices_live
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -25,53 +25,53 @@ SEARCH_REACH = wp.constant(wp.float64(2.0**-10))
 
 
 @wp.func
-def register_slot(replay: Replay, slot: int, f: int):
+def register_slot(replay: cover.Replay, slot: int, f: int):
     first = replay.face_slot[f]
-    replay.slot[slot, SLOT_FACE] = f
-    replay.slot[slot, SLOT_NEXT] = first
-    replay.slot[slot, SLOT_LAST] = -1
+    replay.slot[slot, cover.SLOT_FACE] = f
+    replay.slot[slot, cover.SLOT_NEXT] = first
+    replay.slot[slot, cover.SLOT_LAST] = -1
     if first >= 0:
-        replay.slot[first, SLOT_LAST] = slot
+        replay.slot[first, cover.SLOT_LAST] = slot
     replay.face_slot[f] = slot
 
 
 @wp.func
-def release_triangle(replay: Replay, t: int, face_count: int, free: int):
+def release_triangle(replay: cover.Replay, t: int, face_count: int, free: int):
     """End every registration of triangle t; return how many pooled slots are free."""
     slot = t
     while slot >= 0:
-        before = replay.slot[slot, SLOT_LAST]
-        after = replay.slot[slot, SLOT_NEXT]
+        before = replay.slot[slot, cover.SLOT_LAST]
+        after = replay.slot[slot, cover.SLOT_NEXT]
         if before >= 0:
-            replay.slot[before, SLOT_NEXT] = after
+            replay.slot[before, cover.SLOT_NEXT] = after
         else:
-            replay.face_slot[replay.slot[slot, SLOT_FACE]] = after
+            replay.face_slot[replay.slot[slot, cover.SLOT_FACE]] = after
         if after >= 0:
-            replay.slot[after, SLOT_LAST] = before
+            replay.slot[after, cover.SLOT_LAST] = before
         if slot >= face_count:
             replay.free_slot[free] = slot
             free += 1
-        slot = replay.slot[slot, SLOT_SIBLING]
-    replay.slot[t, SLOT_SIBLING] = -1
+        slot = replay.slot[slot, cover.SLOT_SIBLING]
+    replay.slot[t, cover.SLOT_SIBLING] = -1
     return free
 
 
 @wp.func
-def register_triangle(replay: Replay, t: int, used: int, free: int):
+def register_triangle(replay: cover.Replay, t: int, used: int, free: int):
     """Register triangle t with the faces in replay.scratch.used; return how many pooled slots are left."""
     register_slot(replay, t, replay.scratch.used[0])
     for k in range(1, used):
         free -= 1
         slot = replay.free_slot[free]
-        replay.slot[slot, SLOT_TRIANGLE] = t
-        replay.slot[slot, SLOT_SIBLING] = replay.slot[t, SLOT_SIBLING]
-        replay.slot[t, SLOT_SIBLING] = slot
+        replay.slot[slot, cover.SLOT_TRIANGLE] = t
+        replay.slot[slot, cover.SLOT_SIBLING] = replay.slot[t, cover.SLOT_SIBLING]
+        replay.slot[t, cover.SLOT_SIBLING] = slot
         register_slot(replay, slot, replay.scratch.used[k])
     return free
 
 
 @wp.func
-def search_all(replay: Replay, limit: wp.float64):
+def search_all(replay: cover.Replay, limit: wp.float64):
     """Return the active face with the least bound for the current triangle, or any within `limit`.
 
     The Bvh is of an earlier surface and proposes faces only, dead ones too; their bounds are measured.
@@ -89,8 +89,8 @@ def search_all(replay: Replay, limit: wp.float64):
         while bound > limit and wp.bvh_query_next(query, i):
             f = replay.bvh_face[i]
             if replay.rings.corner_node[3 * f] >= 0:
-                place_face(replay, f)
-                distance = cover_distance_sq(replay, 3, f, bound)
+                cover.place_face(replay, f)
+                distance = cover.cover_distance_sq(replay, 3, f, bound)
                 if distance < bound:
                     best = f
                     bound = distance
@@ -101,7 +101,7 @@ def search_all(replay: Replay, limit: wp.float64):
 
 
 @wp.func
-def component_vanishes(replay: Replay, a: int, b: int):
+def component_vanishes(replay: cover.Replay, a: int, b: int):
     """Tell whether merging a and b removes the last faces of their connected component."""
     if replay.rings.degree[a] + replay.rings.degree[b] > 2 * count_dying(replay.rings, a, b):
         return False
@@ -109,7 +109,7 @@ def component_vanishes(replay: Replay, a: int, b: int):
 
 
 @wp.func
-def queue_ring(replay: Replay, queued: int, node: int, stamp: int):
+def queue_ring(replay: cover.Replay, queued: int, node: int, stamp: int):
     """Queue every triangle registered with a live face at a node; return the new count."""
     k = replay.rings.head[node]
     while k >= 0:
@@ -117,19 +117,19 @@ def queue_ring(replay: Replay, queued: int, node: int, stamp: int):
         if replay.rings.corner_node[3 * f] >= 0:
             slot = replay.face_slot[f]
             while slot >= 0:
-                t = replay.slot[slot, SLOT_TRIANGLE]
-                if replay.slot[t, SLOT_STAMP] != stamp:
-                    replay.slot[t, SLOT_STAMP] = stamp
+                t = replay.slot[slot, cover.SLOT_TRIANGLE]
+                if replay.slot[t, cover.SLOT_STAMP] != stamp:
+                    replay.slot[t, cover.SLOT_STAMP] = stamp
                     replay.queue[queued] = t
                     replay.queue_face[queued] = f
                     queued += 1
-                slot = replay.slot[slot, SLOT_NEXT]
+                slot = replay.slot[slot, cover.SLOT_NEXT]
         k = replay.rings.next[k]
     return queued
 
 
 @wp.func
-def third_rings(replay: Replay, a: int, b: int, stamp: int):
+def third_rings(replay: cover.Replay, a: int, b: int, stamp: int):
     """Make the faces around the third corners of the faces that die with (a, b) candidates; return their count."""
     near_count = int(0)
     k = replay.rings.head[a]
@@ -143,7 +143,7 @@ def third_rings(replay: Replay, a: int, b: int, stamp: int):
                     g = other // 3
                     if replay.rings.corner_node[3 * g] >= 0:
                         if third_corner(g, a, b, replay.rings.corner_node) < 0:
-                            near_count = add_near(replay, near_count, stamp, stamp, g)
+                            near_count = cover.add_near(replay, near_count, stamp, stamp, g)
                     other = replay.rings.next[other]
         k = replay.rings.next[k]
     return near_count
@@ -153,8 +153,7 @@ def third_rings(replay: Replay, a: int, b: int, stamp: int):
 def start_replay_kernel(
     face_count: int,
     face_vertex: wp.array2d(dtype=int),
-    # In and out:
-    replay_inout: Replay,
+    replay_inout: cover.Replay,
 ):
     """Register every original triangle with itself (serial, dim=1).
 
@@ -166,9 +165,9 @@ def start_replay_kernel(
         for k in range(3):
             replay_inout.triangle_pos[f, k] = replay_inout.pos[face_vertex[f, k]]
         if replay_inout.rings.corner_node[3 * f] >= 0:
-            replay_inout.slot[f, SLOT_TRIANGLE] = f
-            replay_inout.slot[f, SLOT_SIBLING] = -1
-            replay_inout.slot[f, SLOT_STAMP] = -1
+            replay_inout.slot[f, cover.SLOT_TRIANGLE] = f
+            replay_inout.slot[f, cover.SLOT_SIBLING] = -1
+            replay_inout.slot[f, cover.SLOT_STAMP] = -1
             register_slot(replay_inout, f, f)
             live += 1
     replay_inout.counter[LIVE_FACES] = live
@@ -179,7 +178,7 @@ def start_replay_kernel(
 
 
 @wp.func(inline=False)
-def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: int, limit: wp.float64):
+def cover_queued(replay: cover.Replay, t: int, first: int, near_count: int, shared: int, limit: wp.float64):
     """Cover triangle t again, with faces around the merge and its other faces; return its squared bound."""
     for k in range(3):
         replay.scratch.polygon[k] = replay.triangle_pos[t, k]
@@ -188,28 +187,28 @@ def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: in
     replay.scratch.used[0] = first
     used = int(0)
     if replay.rings.corner_node[3 * first] >= 0:
-        place_face(replay, first)
-        if cover_distance_sq(replay, 3, first, limit) <= limit:
+        cover.place_face(replay, first)
+        if cover.cover_distance_sq(replay, 3, first, limit) <= limit:
             used = int(1)
     if used == 0:
         own = replay.counter[STAMP] + 1
         replay.counter[STAMP] = own
         for i in range(near_count):
-            place_face(replay, replay.scratch.near[i])
+            cover.place_face(replay, replay.scratch.near[i])
             replay.face_stamp[replay.scratch.near[i]] = shared
         slot = t
         while slot >= 0:
-            f = replay.slot[slot, SLOT_FACE]
+            f = replay.slot[slot, cover.SLOT_FACE]
             if replay.rings.corner_node[3 * f] >= 0:
-                near_count = add_near(replay, near_count, shared, own, f)
-            slot = replay.slot[slot, SLOT_SIBLING]
+                near_count = cover.add_near(replay, near_count, shared, own, f)
+            slot = replay.slot[slot, cover.SLOT_SIBLING]
         if near_count == 0:
             f = search_all(replay, limit)
             for k in range(3):
-                near_count = add_ring(replay, near_count, shared, own, replay.rings.corner_node[3 * f + k])
+                near_count = cover.add_ring(replay, near_count, shared, own, replay.rings.corner_node[3 * f + k])
         free = release_triangle(replay, t, face_count, free)
-        room = wp.min(SLOTS, 1 + free)
-        limit, used = cover_triangle(replay, near_count, shared, own, room, limit)
+        room = wp.min(cover.SLOTS, 1 + free)
+        limit, used = cover.cover_triangle(replay, near_count, shared, own, room, limit)
     else:
         free = release_triangle(replay, t, face_count, free)
     replay.counter[FREE_SLOTS] = register_triangle(replay, t, used, free)
@@ -217,7 +216,7 @@ def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: in
 
 
 @wp.func
-def register_covers(replay: Replay, covers: Covers, begin: int, end: int):
+def register_covers(replay: cover.Replay, covers: cover.Covers, begin: int, end: int):
     """Register triangles with the faces that were found to cover them, for the first in row 0."""
     face_count = replay.face_slot.shape[0]
     free = replay.counter[FREE_SLOTS]
@@ -233,19 +232,25 @@ def register_covers(replay: Replay, covers: Covers, begin: int, end: int):
 
 @wp.func
 def cover_queue(
-    replay: Replay, covers: Covers, merge: wp.vec3i, queued: int, near_count: int, shared: int, limit: wp.float64
+    replay: cover.Replay,
+    covers: cover.Covers,
+    merge: wp.vec3i,
+    queued: int,
+    near_count: int,
+    shared: int,
+    limit: wp.float64,
 ):
     """Cover every queued triangle again, 8 faces at a time where that does it; return the squared bound."""
     i = int(0)
     while i < queued:
         end = i
-        if replay.counter[FREE_SLOTS] >= COVERS_AT_ONCE * SLOTS:
-            end = wp.min(i + COVERS_AT_ONCE, queued)
-            end = cover_ring(replay, covers, merge, near_count, i, end, limit)
+        if replay.counter[FREE_SLOTS] >= cover.COVERS_AT_ONCE * cover.SLOTS:
+            end = wp.min(i + cover.COVERS_AT_ONCE, queued)
+            end = cover.cover_ring(replay, covers, merge, near_count, i, end, limit)
             if end > i:
                 limit = covers.limit[end - i - 1]
             register_covers(replay, covers, i, end)
-        if end < wp.min(i + COVERS_AT_ONCE, queued):
+        if end < wp.min(i + cover.COVERS_AT_ONCE, queued):
             limit = cover_queued(replay, replay.queue[end], replay.queue_face[end], near_count, shared, limit)
             end += 1
         i = end
@@ -253,7 +258,7 @@ def cover_queue(
 
 
 @wp.func
-def merge_rings(replay: Replay, merge: wp.vec3i, near_count: int):
+def merge_rings(replay: cover.Replay, merge: wp.vec3i, near_count: int):
     """Merge two nodes in the forest, and make the faces about the node that they make candidates; their new count."""
     tail = absorb_ring(replay.rings, merge[0], merge[0], merge[1], merge[2], -1)
     tail = absorb_ring(replay.rings, merge[1], merge[0], merge[1], merge[2], tail)
@@ -266,7 +271,7 @@ def merge_rings(replay: Replay, merge: wp.vec3i, near_count: int):
 
 
 @wp.func
-def replay_merge(replay: Replay, covers: Covers, a: int, b: int, c: int, limit: wp.float64):
+def replay_merge(replay: cover.Replay, covers: cover.Covers, a: int, b: int, c: int, limit: wp.float64):
     """Merge nodes a and b into c and cover the triangles of their faces again; return the squared bound."""
     stamp = replay.counter[STAMP] + 1
     replay.counter[STAMP] = stamp
@@ -290,10 +295,8 @@ def replay_merges_kernel(
     merge_count: int,
     cover_budget: int,
     merge_pair: wp.array2d(dtype=int),
-    # In and out:
-    replay_inout: Replay,
-    covers_inout: Covers,
-    # Out:
+    replay_inout: cover.Replay,
+    covers_inout: cover.Covers,
     bound_sq_out: wp.array(dtype=wp.float64),
 ):
     """Apply merges until `cover_budget` triangles have been covered again (serial, dim=1).
@@ -304,7 +307,7 @@ def replay_merges_kernel(
     Invariant: every registered triangle lies within the running maximum of the faces that it is registered with.
     """
     j = replay_inout.counter[NEXT_MERGE]
-    limit = FLOOR * FLOOR
+    limit = cover.FLOOR * cover.FLOOR
     if j > 0:
         limit = bound_sq_out[j - 1]
     covers = int(0)
@@ -318,7 +321,7 @@ def replay_merges_kernel(
             replay_inout.counter[INDEXED] = -1
             break
         c = vertex_count + j
-        fetch_merge(replay_inout, merge_pair, merge_count, j)
+        cover.fetch_merge(replay_inout, merge_pair, merge_count, j)
         limit = replay_merge(replay_inout, covers_inout, a, b, c, limit)
         covers += replay_inout.counter[QUEUED] + 1
         bound_sq_out[j] = limit

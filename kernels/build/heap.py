@@ -1,10 +1,6 @@
 """Priority queue of edges: a 4-ary heap with the smallest entry first.
 
-An entry is a float64 key and a packed edge, a < b, with the stage that it has reached:
-
-    63          32 31           2 1     0
-    |      a      |      b      | stage |
-
+An entry is a float64 key and a packed edge with the stage that it has reached (`pack_pair`).
 The order (key, edge) is total, so the merge sequence depends neither on the heap's layout nor on where a launch ends.
 """
 

@@ -7,7 +7,7 @@ distance of that middle is a lower bound, so the gap between both is known.
 
 import warp as wp
 
-from warp_abtree.kernels.build.polygon import POLYGON_CORNERS, Scratch, box_distance_sq, face_distance_sq, load_polygon, polygon_distance_sq, polygon_middle, split_polygon, store_polygon
+from warp_abtree.kernels.build import polygon
 from warp_abtree.kernels.build.triangle_cover import FLOOR
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -33,7 +33,7 @@ class Original:
 
 @wp.func
 def node_distance_sq(original: Original, node: int, p: wp.vec3d):
-    return box_distance_sq(p, wp.vec3d(original.node_lower[node]), wp.vec3d(original.node_upper[node]))
+    return polygon.box_distance_sq(p, wp.vec3d(original.node_lower[node]), wp.vec3d(original.node_upper[node]))
 
 
 @wp.func
@@ -42,7 +42,7 @@ def nearest_original(original: Original, p: wp.vec3d, guess: int):
     stack = wp.zeros(shape=(TREE_ROOM,), dtype=wp.int32)
     gap = wp.zeros(shape=(TREE_ROOM,), dtype=wp.float64)
     best = guess
-    least = face_distance_sq(original.face_pos, guess, p)
+    least = polygon.face_distance_sq(original.face_pos, guess, p)
     stack[0] = 1
     top = int(1)
     while top > 0:
@@ -51,7 +51,7 @@ def nearest_original(original: Original, p: wp.vec3d, guess: int):
             node = stack[top]
             f = original.node_face[node]
             if f >= 0:
-                distance = face_distance_sq(original.face_pos, f, p)
+                distance = polygon.face_distance_sq(original.face_pos, f, p)
                 if distance < least:
                     least = distance
                     best = f
@@ -71,7 +71,9 @@ def nearest_original(original: Original, p: wp.vec3d, guess: int):
 
 
 @wp.func
-def bound_triangle(original: Original, scratch: Scratch, depth: wp.array(dtype=int), guess: int, found: wp.float64):
+def bound_triangle(
+    original: Original, scratch: polygon.Scratch, depth: wp.array(dtype=int), guess: int, found: wp.float64
+):
     """Bound the squared distance of any point of the current triangle from the original surface.
 
     Args:
@@ -79,7 +81,7 @@ def bound_triangle(original: Original, scratch: Scratch, depth: wp.array(dtype=i
         guess: An original face to start from.
         found: Squared distance of some point of the whole surface; bounds below it are not refined.
     """
-    store_polygon(scratch, 0, 3)
+    polygon.store_polygon(scratch, 0, 3)
     depth[0] = 0
     top = int(1)
     visited = int(0)
@@ -88,26 +90,26 @@ def bound_triangle(original: Original, scratch: Scratch, depth: wp.array(dtype=i
     worst = wp.float64(0.0)
     while top > 0:
         top -= 1
-        count = load_polygon(scratch, top)
+        count = polygon.load_polygon(scratch, top)
         level = depth[top]
         visited += 1
         if visited % SLACK_PERIOD == 0:
             slack = slack * wp.float64(4.0)
             floor = floor * wp.float64(4.0)
         enough = wp.max(slack * found, floor)
-        bound = polygon_distance_sq(original.face_pos, scratch, count, guess, enough)
+        bound = polygon.polygon_distance_sq(original.face_pos, scratch, count, guess, enough)
         if bound > enough:
-            guess, reached = nearest_original(original, polygon_middle(scratch, count), guess)
+            guess, reached = nearest_original(original, polygon.polygon_middle(scratch, count), guess)
             found = wp.max(found, reached)
             enough = wp.max(slack * found, floor)
-            if level >= DEPTH or count + 4 > POLYGON_CORNERS:
+            if level >= DEPTH or count + 4 > polygon.POLYGON_CORNERS:
                 enough = wp.float64(wp.inf)
-            bound = polygon_distance_sq(original.face_pos, scratch, count, guess, enough)
+            bound = polygon.polygon_distance_sq(original.face_pos, scratch, count, guess, enough)
             if bound > enough:
                 bound = wp.float64(0.0)  # its parts bound it
                 first = top
                 margin = FLOOR + MARGIN * wp.sqrt(found - reached)
-                top = split_polygon(original.face_pos, scratch, count, top, guess, margin)
+                top = polygon.split_polygon(original.face_pos, scratch, count, top, guess, margin)
                 for i in range(first, top):
                     depth[i] = level + 1
         worst = wp.max(worst, bound)
@@ -119,7 +121,6 @@ def measure_points_kernel(
     point: wp.array(dtype=wp.vec3d),
     guess: wp.array(dtype=int),
     original: Original,
-    # Out:
     distance_sq_out: wp.array(dtype=wp.float64),
 ):
     """Measure squared distances of points to the original surface, each from a face that may be near."""
@@ -134,10 +135,8 @@ def bound_faces_kernel(
     corner: wp.array2d(dtype=wp.vec3d),
     face: wp.array(dtype=int),
     original: Original,
-    # In and out:
-    scratch_inout: Scratch,
+    scratch_inout: polygon.Scratch,
     depth_inout: wp.array(dtype=int),
-    # Out:
     bound_sq_out: wp.array(dtype=wp.float64),
 ):
     """Bound the squared distance of every point of each active face to the original surface (serial, dim=1).

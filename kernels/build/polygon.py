@@ -6,6 +6,8 @@ Source: Ericson, Real-Time Collision Detection, section 5.1.5 (closest point).
 
 import warp as wp
 
+from warp_abtree.kernels.triangle.segment import nearest_on_segment
+
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 STACK = wp.constant(64)  # polygons on the stack
@@ -26,12 +28,7 @@ class Scratch:
 
 @wp.func
 def segment_distance_sq(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    ab = b - a
-    size = wp.dot(ab, ab)
-    t = wp.float64(0.0)
-    if size > wp.float64(0.0):
-        t = wp.min(wp.max(wp.dot(p - a, ab) / size, wp.float64(0.0)), wp.float64(1.0))
-    return wp.length_sq(p - (a + ab * t))
+    return wp.length_sq(p - nearest_on_segment(a, b, p))
 
 
 @wp.func

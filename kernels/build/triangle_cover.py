@@ -7,7 +7,7 @@ upper bound. A partition along the prisms over the faces gives zero where the su
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.build.polygon import POLYGON_CORNERS, STACK, Scratch, box_distance_sq, face_distance_sq, load_polygon, polygon_distance_sq, polygon_middle, split_polygon, store_polygon
+from warp_abtree.kernels.build import polygon
 from warp_abtree.kernels.build.vertex_forest import Rings
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -44,7 +44,7 @@ class Replay:
 
     counter: wp.array(dtype=int)  # [6], see `hausdorff_bound`
     rings: Rings  # of the vertex forest
-    scratch: Scratch  # of the current triangle
+    scratch: polygon.Scratch  # of the current triangle
     pos: wp.array(dtype=wp.vec3d)  # [node_count], normalised
     triangle_pos: wp.array2d(dtype=wp.vec3d)  # [face_count, 3], original triangles
     face_pos: wp.array2d(dtype=wp.vec3d)  # [face_count, 3], corners of candidates
@@ -118,10 +118,10 @@ def cover_distance_sq(replay: Replay, count: int, f: int, enough: wp.float64):
     """
     beyond = wp.max(BOX_SLACK * enough, BOX_MIN)
     for i in range(count):
-        least = box_distance_sq(replay.scratch.polygon[i], replay.face_box[f, 0], replay.face_box[f, 1])
+        least = polygon.box_distance_sq(replay.scratch.polygon[i], replay.face_box[f, 0], replay.face_box[f, 1])
         if least > beyond:
             return least
-    return polygon_distance_sq(replay.face_pos, replay.scratch, count, f, enough)
+    return polygon.polygon_distance_sq(replay.face_pos, replay.scratch, count, f, enough)
 
 
 @wp.func
@@ -148,9 +148,9 @@ def point_nearest_face(replay: Replay, near_count: int, p: wp.vec3d):
     best_distance = wp.float64(wp.inf)
     for i in range(near_count):
         f = replay.scratch.near[i]
-        gap = box_distance_sq(p, replay.face_box[f, 0], replay.face_box[f, 1])
+        gap = polygon.box_distance_sq(p, replay.face_box[f, 0], replay.face_box[f, 1])
         if gap <= wp.max(BOX_SLACK * best_distance, BOX_MIN):
-            distance = face_distance_sq(replay.face_pos, f, p)
+            distance = polygon.face_distance_sq(replay.face_pos, f, p)
             if distance < best_distance:
                 best = f
                 best_distance = distance
@@ -188,7 +188,7 @@ def approach_point(replay: Replay, near_count: int, shared: int, own: int, p: wp
     Returns the squared distance and the new count.
     """
     f = point_nearest_face(replay, near_count, p)
-    distance = face_distance_sq(replay.face_pos, f, p)
+    distance = polygon.face_distance_sq(replay.face_pos, f, p)
     moving = bool(True)
     while moving and distance > limit:
         moving = bool(False)
@@ -196,7 +196,7 @@ def approach_point(replay: Replay, near_count: int, shared: int, own: int, p: wp
         for k in range(3):
             near_count = add_ring(replay, near_count, shared, own, replay.rings.corner_node[3 * f + k])
         while i < near_count:
-            other = face_distance_sq(replay.face_pos, replay.scratch.near[i], p)
+            other = polygon.face_distance_sq(replay.face_pos, replay.scratch.near[i], p)
             if other < distance:
                 distance = other
                 f = replay.scratch.near[i]
@@ -250,13 +250,13 @@ def cover_triangle(replay: Replay, near_count: int, shared: int, own: int, room:
 
     Returns the squared bound, at least `limit`, and how many faces are used.
     """
-    store_polygon(replay.scratch, 0, 3)
+    polygon.store_polygon(replay.scratch, 0, 3)
     top = int(1)
     cuts = int(0)
     used = int(0)
     while top > 0:
         top -= 1
-        count = load_polygon(replay.scratch, top)
+        count = polygon.load_polygon(replay.scratch, top)
         best, bound = nearest_candidate(replay, count, near_count, limit)
         final = bound <= limit
         if not final:
@@ -265,7 +265,7 @@ def cover_triangle(replay: Replay, near_count: int, shared: int, own: int, room:
             if near_count > before:
                 best, bound = nearest_candidate(replay, count, near_count, limit)
             final = bound <= wp.max(COVER_SLACK_SQ * least, limit) or cuts >= CUTS
-            final = final or top + 4 >= STACK or count + 4 > POLYGON_CORNERS
+            final = final or top + 4 >= polygon.STACK or count + 4 > polygon.POLYGON_CORNERS
         if final:
             used = use_face(replay, count, used, room, best)
             if replay.scratch.used[used - 1] != best:
@@ -273,6 +273,8 @@ def cover_triangle(replay: Replay, near_count: int, shared: int, own: int, room:
             limit = wp.max(limit, bound)
         else:
             cuts += 1
-            over = point_nearest_face(replay, near_count, polygon_middle(replay.scratch, count))
-            top = split_polygon(replay.face_pos, replay.scratch, count, top, over, FLOOR + COVER_MARGIN * wp.sqrt(limit))
+            over = point_nearest_face(replay, near_count, polygon.polygon_middle(replay.scratch, count))
+            top = polygon.split_polygon(
+                replay.face_pos, replay.scratch, count, top, over, FLOOR + COVER_MARGIN * wp.sqrt(limit)
+            )
     return limit, used

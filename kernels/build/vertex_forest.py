@@ -113,7 +113,6 @@ def are_distinct(corner: wp.vec3i):
 def link_rings_kernel(
     face_count: int,
     face_vertex: wp.array2d(dtype=int),
-    # In and out:
     rings_inout: Rings,
 ):
     """Link the corners of every face with three distinct corners; mark the others dead (serial, dim=1).
@@ -168,9 +167,7 @@ def count_events_kernel(
     node_count: int,
     face_vertex: wp.array2d(dtype=int),
     vertex_parent: wp.array(dtype=int),
-    # In and out:
     split_size_inout: wp.array(dtype=wp.int64),
-    # Out:
     face_split_out: wp.array(dtype=int),
 ):
     """Find the merge at which each face dies, and count the faces that every split touches (serial, dim=1).
@@ -198,9 +195,7 @@ def fill_events_kernel(
     node_count: int,
     face_vertex: wp.array2d(dtype=int),
     vertex_parent: wp.array(dtype=int),
-    # In and out:
     split_cursor_inout: wp.array(dtype=wp.int64),
-    # Out:
     split_face_out: wp.array(dtype=int),
 ):
     """Write every face to the slices of the splits that touch it (serial, dim=1: each slice comes out ascending).

@@ -241,7 +241,7 @@ def measure_travel_kernel(
     sums: ChunkSums,
     pair_contacts_inout: PairContacts,
 ):
-    """Estimate the travel of one object pair a warp, and pose its mean point; see `warp_abtree.query.contacts`."""
+    """Estimate the travel of one object pair a warp, and pose its mean point; see `query.stages.contacts`."""
     p = wp.tid() / warp_size()
     _, number = sum_lengths(p, start, sums)
     if number == wp.float64(0.0):

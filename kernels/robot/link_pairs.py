@@ -16,6 +16,7 @@ The joints that both parts of a pair hang on move them as one and do not count.
 import warp as wp
 
 from warp_abtree.kernels.base.boxes import round_down, round_up
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.robot.forward import PRISMATIC, REVOLUTE, Chain, Frames
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -101,19 +102,23 @@ def pair_reach(mode: wp.int32, chain: Chain, frames: Frames, parts: Parts, chunk
     return reach
 
 
+@wp.struct
+class LinkBoxes:
+    """Boxes of the objects of the surroundings and of the parts of all configurations."""
+
+    lower: wp.array(dtype=wp.vec3)  # shape [object]
+    upper: wp.array(dtype=wp.vec3)  # shape [object]
+    bvh: wp.uint64  # of the surroundings, 0 where there are none
+
+
 @wp.func
 def append_link_pair(
-    first: wp.int32,
-    second: wp.int32,
-    distance: wp.float64,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    distances: wp.array(dtype=wp.float64),
+    first: wp.int32, second: wp.int32, distance: wp.float64, batch: PairBatch, distances: wp.array(dtype=wp.float64)
 ):
     """Append a pair of objects; the count goes on past the capacity."""
-    slot = wp.atomic_add(pair_count, 0, 1)
-    if slot >= 0 and slot < pairs.shape[0]:
-        pairs[slot] = wp.vec2i(first, second)
+    slot = wp.atomic_add(batch.count, 0, 1)
+    if slot >= 0 and slot < batch.pairs.shape[0]:
+        batch.pairs[slot] = wp.vec2i(first, second)
         if slot < distances.shape[0]:
             distances[slot] = distance
 
@@ -131,15 +136,12 @@ def find_link_pair_kernel(
     mode: wp.int32,
     stage: wp.vec2i,
     around: wp.int32,
-    bvh: wp.uint64,
     chain: Chain,
     parts: Parts,
     frames: Frames,
-    lower: wp.array(dtype=wp.vec3),
-    upper: wp.array(dtype=wp.vec3),
+    boxes: LinkBoxes,
     chunk_inout: Chunk,
-    pair_count_inout: wp.array(dtype=wp.int32),
-    pairs_out: wp.array(dtype=wp.vec2i),
+    batch_inout: PairBatch,
     distances_out: wp.array(dtype=wp.float64),
 ):
     """Find the pairs of a stage whose boxes are near enough, a configuration a thread that is not decided yet.
@@ -147,7 +149,6 @@ def find_link_pair_kernel(
     Args:
         stage: First entry of `Parts`, and the one behind the last.
         around: Objects of the surroundings, which come before those of parts.
-        bvh: Of their boxes.
         distances_out: Up to what distance each pair matters [robot units]; [0] where that is 0.
     """
     i = wp.tid()
@@ -161,21 +162,21 @@ def find_link_pair_kernel(
         wide = wp.float64(reach)
         if mode == ASK_WITHIN and reach > HOPELESS * parts.radius[parts.first[entry]]:
             reach = wp.float64(0.0)
-        least, most = lower[first], upper[first]
+        least, most = boxes.lower[first], boxes.upper[first]
         if mode != ASK_ANY:
             for k in range(3):
                 least[k] = round_down(wp.max(wp.float64(least[k]) - wide, -FARTHEST))
                 most[k] = round_up(wp.min(wp.float64(most[k]) + wide, FARTHEST))
         if second < 0:
-            query = wp.bvh_query_aabb(bvh, least, most)
+            query = wp.bvh_query_aabb(boxes.bvh, least, most)
             while wp.bvh_query_next(query, j):
                 if parts.meets[j] != wp.uint8(0):
                     if wide > reach:
                         chunk_inout.near[i] = wp.uint8(1)
-                    append_link_pair(first, j, reach, pair_count_inout, pairs_out, distances_out)
+                    append_link_pair(first, j, reach, batch_inout, distances_out)
         else:
             j = base + second
-            if boxes_meet(least, most, lower[j], upper[j]):
+            if boxes_meet(least, most, boxes.lower[j], boxes.upper[j]):
                 if wide > reach:
                     chunk_inout.near[i] = wp.uint8(1)
-                append_link_pair(first, j, reach, pair_count_inout, pairs_out, distances_out)
+                append_link_pair(first, j, reach, batch_inout, distances_out)

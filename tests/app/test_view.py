@@ -169,8 +169,8 @@ def test_only_changes_are_sent(playback):
     assert ("/intersecting/0", "vertices") in heard
     data, heard = show.show({1: 40})
     assert {key for name, key in heard if name == "/objects/1"} == {"vertices", "faces"}
-    assert len(show.api.handles["/objects/1"].faces) == show.cache.count(1, 40)
-    assert data.faces == 2 * 320 + show.cache.count(1, 40)
+    assert len(show.api.handles["/objects/1"].faces) == len(show.cache.mesh(1, 40)[1])
+    assert data.faces == 2 * 320 + len(show.cache.mesh(1, 40)[1])
     assert data.error_mean == pytest.approx(playback.scene.models[1].error_at(40) / 3)
     heard = show.show(moved={0: -50})[1]
     assert ("/intersecting/1", "visible") in heard and not show.api.handles["/intersecting/1"].visible

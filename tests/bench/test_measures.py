@@ -13,7 +13,7 @@ from bench.cases.update import bound_nodes, find_crossover
 from bench.studies.motions import Motions, PoseScene, find_first_contact
 from bench.studies.paper import update
 from bench.studies.tradeoff import regions, summaries, workload
-from warp_abtree.query.contacts import contact_dtypes
+from warp_abtree.query.result import contact_dtypes
 
 pytestmark = pytest.mark.slow
 

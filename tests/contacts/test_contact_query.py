@@ -70,7 +70,7 @@ def test_any_order_of_hits(device):
             hits = query.hits.face.numpy().copy()
             hits[:k], hits[k:] = rng.permutation(hits[:k]), -1
             query.hits.face.assign(hits)
-            query.find_contacts()
+            query.report()
             same(query.result(), expected)
 
 

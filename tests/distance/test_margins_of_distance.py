@@ -132,7 +132,8 @@ def check_queries(query, truths, size):
         assert to_bytes(query.result()) == to_bytes(first)
         if turn > 16:
             query.forget()
-    assert (query._slabs.made.numpy()[:, 0] >= 0).sum() == len(query.batch.states.slots), "slabs of all states"
+    made = query.stages[-1].slabs.made.numpy()[:, 0] >= 0
+    assert made.sum() == len(query.batch.states.slots), "slabs of all states"
 
 
 @pytest.mark.parametrize("far", [0.0, 100.0])
@@ -210,7 +211,7 @@ def test_margins_of_slabs_cover_roundings_that_add_up(device, case):
             query.run()
             query.forget()
             found = query.run()
-            assert (query._slabs.made.numpy()[:, 0] >= 0).sum() == 2
+            assert (query.stages[-1].slabs.made.numpy()[:, 0] >= 0).sum() == 2
         np.testing.assert_allclose(found.distance, distance, rtol=1e-6)
 
 

@@ -12,8 +12,8 @@ from oracles.triangle import into_frame_of_a, quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
-from warp_abtree.kernels.base.poses import SLAB_DEPTH, PairPose
+from warp_abtree.kernels.base.arrays import Trees
+from warp_abtree.kernels.base.poses import SLAB_DEPTH, PairBatch
 from warp_abtree.kernels.search.item import pack_item
 from warp_abtree.kernels.search.slab_overlap import DIRECTION_LENGTH, slabs_overlap
 
@@ -76,18 +76,17 @@ def test_nested_parts_equal_brute_force(device, gap):
 @wp.kernel
 def compare_slabs_kernel(
     margin_factor: wp.float32,
-    models: ModelPool,
-    states: StatePool,
-    pair_poses: wp.array(dtype=PairPose),
+    trees: Trees,
+    batch: PairBatch,
     nodes: wp.array(dtype=wp.vec2i),
     overlap_out: wp.array(dtype=wp.int32),
 ):
     """Note which nodes slabs do not separate."""
     i = wp.tid()
-    pose = pair_poses[0]
+    pose = batch.poses[0]
     pose.margin = pose.margin * margin_factor
     item = pack_item(nodes[i][0], nodes[i][1])
-    overlap_out[i] = wp.where(slabs_overlap(models, states, pose, item), 1, 0)
+    overlap_out[i] = wp.where(slabs_overlap(trees, pose, item), 1, 0)
 
 
 def touching_soups(device, rng, count, reach_a, reach_b):
@@ -114,7 +113,7 @@ def count_lost(query, trees, levels, margin_factor):
     leaves = np.stack([tree.leaf_node for tree in trees], 1)
     nodes = wp.array(leaves >> levels, dtype=wp.vec2i, device=query.device)
     overlap = wp.zeros(len(nodes), dtype=wp.int32, device=query.device)
-    inputs = [margin_factor, query.batch.models.pool, query.batch.states.pool, query.pair_poses, nodes, overlap]
+    inputs = [margin_factor, query.batch.trees, query.pair_batch, nodes, overlap]
     wp.launch(compare_slabs_kernel, dim=len(nodes), inputs=inputs, device=query.device)
     return int((overlap.numpy() == 0).sum())
 

@@ -9,8 +9,7 @@ import warp as wp
 
 import warp_abtree as ab
 from helpers import scenes
-from warp_abtree.kernels.contacts.chunks import CHUNK
-from warp_abtree.query.contacts import VECTORS
+from warp_abtree.query.result import VECTORS
 from warp_abtree.state.arrays import SLOT_COLUMNS
 
 PAIRS = np.array([(0, 1), (1, 2), (3, 1)])
@@ -66,26 +65,19 @@ def check_answers(before, scene):
 
 
 def check_buffer_lengths(queries):
-    """Check that all arrays with an entry a pair or a contact are of one length, or kernels write past an end."""
+    """Check that all arrays are as long as there is room for, or kernels write past an end."""
     for query in queries:
-        rooms = [query.pairs, query.pair_poses]
-        for hits in (query.hits, query.near):
-            if hits is not None:
-                rooms += [hits.any_hit, hits.count, hits.node_tests, hits.triangle_tests, hits.exact_tests]
-        rooms += [] if query.near is None else [query.within]
-        rooms += [] if query.broad_phase is None else [query.broad_phase.pairs]
+        rooms = query.rooms
+        pairs, hits = ([query.pairs, query.pair_poses, query.hits.any_hit, query.hits.count], [query.hits.face])
+        pairs += [] if query.near is None else [query.near.any_hit, query.near.count, query.distances_of("within")]
+        pairs += [] if query.broad_phase is None else [query.broad_phase.pairs]
         if isinstance(query, ab.ContactQuery):
-            means, sums, contacts = query.pair_contacts, query._sums, query.contacts
-            rooms += [means.point, means.normal, means.travel, sums.middle, query.start[1:]]
-            places = [query.hits.face, query.faces, *(getattr(contacts, name) for name in (*VECTORS, "coplanar"))]
-            if query._gap is not None:
-                rooms.append(query.hits.gap)
-                places.append(contacts.separation)
-            assert len({len(array) for array in (*places, query._key[::2], query._order[::2])}) == 1
-            names = ("point", "normal", "length", "area", "change", "front", "back", "crossed", "span")
-            chunks = [getattr(sums, name) for name in names]
-            assert {len(array) for array in chunks} == {len(query.hits.face) // int(CHUNK) + len(query.pairs)}
-        assert len({len(room) for room in rooms}) == 1
+            means, contacts = query.pair_contacts, query.contacts
+            pairs += [means.point, means.normal, means.travel, query.start[1:]]
+            hits += [query.faces, *(getattr(contacts, name) for name in (*VECTORS, "coplanar"))]
+        assert {len(array) for array in pairs} == {rooms.pairs} and {len(array) for array in hits} == {rooms.hits}
+        for asked in (asked for stage in query.stages for asked in [*stage.arrays(rooms), *stage.state_arrays()]):
+            assert asked.is_in_place(), f"{asked.name}: not {asked.shape}"
 
 
 @contextmanager

@@ -65,8 +65,6 @@ def stop_after(count):
 class ColumnJob:
     """A job whose columns have any length."""
 
-    unit = "pose"
-
     def __init__(self, count=4, shard=2, rows=None, size=1, output="count"):
         self.count, self.shard, self.rows, self.size, self.output = count, shard, rows, size, output
 

@@ -11,7 +11,7 @@ from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
 from warp_abtree.scene import sweep as pose_sweep
-from warp_abtree.scene.poses import device_rows
+from warp_abtree.state.poses import device_rows
 
 
 def speaking(array, *names):

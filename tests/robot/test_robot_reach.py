@@ -43,7 +43,7 @@ def find_reach(description, device, middle, half, size):
     """Return the reach of the only part at a configuration, and where its vertices stand there as computed."""
     robot = ab.Robot(description, device)
     batch = RobotBatch(None, robot.models, 1, robot.device)
-    links = LinkHits(batch.batch, make_link_request(robot, batch, 1), 1, True).links
+    links = LinkHits(batch.batch, make_link_request(robot, batch, 1), 1, True)
     for target, values in ((links.configurations, middle), (links.chunk.half, half), (links.chunk.size, size)):
         target.assign(np.array(values, np.float64)[None])
     links.place()

@@ -14,7 +14,7 @@ from oracles.triangle import pose_matrix, quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.query import narrow_phase
+from warp_abtree.query import operator
 from warp_abtree.scene import pipeline
 from warp_abtree.state import work_lists
 
@@ -316,7 +316,7 @@ def test_refused(options, message):
 def test_the_room_of_the_first_frame(device, monkeypatch):
     """Of coincident objects, asked as on CUDA, float32 leaves many pairs open: room is made, or its lack is told."""
     monkeypatch.setattr(pipeline, "Query", GpuQuery)
-    monkeypatch.setattr(narrow_phase, "UNCERTAIN_ROOM", 16)
+    monkeypatch.setattr(operator, "UNCERTAIN_ROOM", 16)
     coincident = in_a_row(device, "twins", (0, 0, 0))
     frame = ab.Pipeline(coincident, output="count")
     needed = int(frame.run().float64_tests.sum())

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 
+from warp_abtree.checks.upload import zeros_of
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.bodies import bodies as body_kernels
 from warp_abtree.kernels.bodies import graph_coloring
-from warp_abtree.simulate.body_state import zeros_of
 
 COLORS = int(graph_coloring.COLOR_COUNT)
 
@@ -17,10 +18,11 @@ def color_pairs(device, pairs, dynamic, rounds):
     bodies.motion_type.assign(np.where(dynamic, int(body_kernels.DYNAMIC), 0))
     bodies.rank.assign(np.arange(len(dynamic)))
     color = wp.full(len(pairs), COLORS, dtype=wp.int32, device=device)
-    rows = wp.array(pairs, dtype=wp.vec2i, device=device)
+    batch = PairBatch()
+    batch.pairs = wp.array(pairs, dtype=wp.vec2i, device=device)
     for turn in range(COLORS * rounds):
         for kernel in (graph_coloring.bid_kernel, graph_coloring.assign_color_kernel):
-            wp.launch(kernel, len(pairs), [turn, rounds, rows, color, bodies], device=device)
+            wp.launch(kernel, len(pairs), [turn, rounds, batch, color, bodies], device=device)
     return color.numpy()
 
 

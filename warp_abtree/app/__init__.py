@@ -2,6 +2,6 @@
 
 from warp_abtree.app.toml.errors import SceneError
 from warp_abtree.app.toml.scene_file import SceneFile, load_scene
-from warp_abtree.app.viewer.still import view
+from warp_abtree.app.viewer.command import view
 
 __all__ = ["SceneError", "SceneFile", "load_scene", "view"]

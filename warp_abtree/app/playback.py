@@ -65,22 +65,13 @@ class Playback:
 
     def modes(self) -> list[str]:
         """Return the modes of choosing LODs, as `choose` takes them."""
-        names = [name for name in CONTROLLERS if name != "none"]
-        return [
-            OWN_MODE,
-            HOLD_MODE,
-            *(name for name in names if name != "tolerance" or self.control.tolerance is not None),
-        ]
+        left_out = ("none",) if self.control.tolerance is not None else ("none", "tolerance")
+        return [OWN_MODE, HOLD_MODE, *(name for name in CONTROLLERS if name not in left_out)]
 
     def choose(self, mode, budget_ms=None):
-        """Choose LODs in one of `modes`.
+        """Choose LODs in one of `modes`, by a budget [ms], None for the file's.
 
-        Args:
-            mode: "scene", "hold", or a controller.
-            budget_ms: T of a controller [ms]; None is the file's.
-
-        Raises:
-            ValueError: A controller without its budget, or another mode; the mode before is kept.
+        Raises ValueError for a controller without its budget, or another mode, and keeps the mode before.
         """
         if mode == HOLD_MODE:
             inner, self.chosen = None, self.scene.lods
@@ -114,11 +105,7 @@ class Playback:
         return Snapshot(self.number, self.time, self._poses.copy(), self.scene.lods, result, row)
 
     def step(self, output) -> Snapshot:
-        """Run the next frame. Waits for the device.
-
-        Args:
-            output: "count", "faces" or "contacts".
-        """
+        """Run the next frame, with output "count", "faces" or "contacts". Waits for the device."""
         self._frame.output = output
         result = self._frame.step()
         self.chosen, row = self.scene.lods, self._frame.history[-1]
@@ -147,60 +134,45 @@ class ScenePlayback(Playback):
         return self.loaded.motion.poses(self.time) if self._bodies is None else self._bodies.poses()
 
 
-class MeshPlayback(Playback):
+class StillPlayback(Playback):
+    """A scene that stands at its poses, by default those of now; LODs begin where they are, and are swept if told."""
+
+    def __init__(self, scene: Scene, title: str, poses=None, sweep=None):
+        self._held = PoseInput(scene).poses.numpy().copy() if poses is None else np.array(poses, np.float64)
+        self._started, self._sweep = scene.lods, sweep
+        super().__init__(scene, title, scene.worlds, 1 / 30, MeshView())
+
+    def _begin(self):
+        self.scene.set_lods(self._started)
+        frame = Frame(self.scene, None, self._sweep, time_step=self.time_step)
+        frame.warm_up()
+        return frame, None, self._sweep
+
+    def _poses_now(self):
+        return self._held
+
+
+class MeshPlayback(StillPlayback):
     """Meshes at poses (n, 7), whose LODs sweep from where they start to the base and back."""
 
     def __init__(self, models, poses, lods, device=None):
-        self._start = np.array(poses, np.float64)
         scene = Scene(device=device)
         for model, pose, lod in zip(models, poses, lods):
             scene.add(model, pose=pose, lod=lod)
-        self._first = scene.lods
         self._sweeps = []
         for model in scene.models:
             mine = np.array([i for i, other in enumerate(models) if other is model])
             start = _fraction_at(model, lods[mine[0]])
             self._sweeps.append(LodSweep([(model, mine)], start, min(start, _fraction_at(model, 0)), SWEEP_PERIOD))
-        names = " and ".join(dict.fromkeys(map(_title, models)))
-        super().__init__(scene, names, np.zeros(len(models), int), 1 / 30, MeshView())
+        names = (m.name if m.parts == 1 else f"{m.name} ({m.parts} parts joined)" for m in models)
+        super().__init__(scene, " and ".join(dict.fromkeys(names)), poses, self._lods_at)
 
-    def _begin(self):
-        self.scene.set_lods(self._first)
-        frame = Frame(self.scene, None, self._sweep, time_step=self.time_step)
-        frame.warm_up()
-        return frame, None, self._sweep
-
-    def _sweep(self, time):
-        lods = self._first.astype(np.int64)
+    def _lods_at(self, time):
+        lods = self._started.astype(np.int64)
         for sweep in self._sweeps:
             sweep.apply(sweep.fraction(time), lods)
         return lods
 
-    def _poses_now(self):
-        return self._start
-
-
-class StillPlayback(Playback):
-    """A scene that stands at its poses; LODs begin where they are."""
-
-    def __init__(self, scene: Scene, title: str):
-        self._poses_held = PoseInput(scene).poses.numpy().copy()
-        self._lods_held = scene.lods
-        super().__init__(scene, title, scene.worlds, 1 / 30, MeshView())
-
-    def _begin(self):
-        self.scene.set_lods(self._lods_held)
-        frame = Frame(self.scene, time_step=self.time_step)
-        frame.warm_up()
-        return frame, None, None
-
-    def _poses_now(self):
-        return self._poses_held
-
-
-def _title(model) -> str:
-    return model.name if model.parts == 1 else f"{model.name} ({model.parts} parts joined)"
-
 
 def _fraction_at(model, lod) -> float:
-    return len(model.mesh_at(lod)[2]) / model.face_count
+    return model.progressive.active_count(lod) / model.face_count

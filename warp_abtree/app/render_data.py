@@ -67,11 +67,7 @@ def objects_of_world(worlds, world: int) -> np.ndarray:
 
 
 def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Settings) -> RenderData:
-    """Return what to draw.
-
-    Args:
-        shown: Indices of the objects that are shown, rising.
-    """
+    """Return what to draw of the objects that are shown, whose indices rise."""
     scene, result = cache.scene, snapshot.result
     inside = np.zeros(scene.object_count, bool)
     inside[shown] = True
@@ -89,7 +85,7 @@ def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Sett
         shown=shown,
         intersecting_count=len(intersecting),
         pair_count=int(result.count[pairs].sum()) if result.count is not None else 0,
-        faces=sum(cache.count(model, lod) * n for model, lod, n in meshes),
+        faces=sum(scene.models[model].progressive.active_count(lod) * n for model, lod, n in meshes),
         error_mean=sum(scene.models[model].error_at(lod) * n for model, lod, n in meshes) / max(len(shown), 1),
         nearest=nearest,
         distance=distance,

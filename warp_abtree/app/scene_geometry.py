@@ -5,6 +5,7 @@ The viewer sends these arrays to the browser, and pictures draw them.
 
 import numpy as np
 
+from warp_abtree.app.cli.model_commands import diagonal_of
 from warp_abtree.app.styles import COLOURS
 from warp_abtree.checks.quaternions import matrices_of
 from warp_abtree.scene.scene import Scene
@@ -23,20 +24,13 @@ def place(poses, objects, points) -> np.ndarray:
 
 
 class MeshCache:
-    """Meshes of models at LODs; the least recently used are dropped when there are too many faces.
-
-    Args:
-        scene: `Scene`.
-    """
+    """Meshes of a scene's models at LODs; the least recently used are dropped when there are too many faces."""
 
     def __init__(self, scene: Scene):
         self.scene = scene
         self._kept: dict = {}
         self._faces = 0
-        self.diagonals = []
-        for model in scene.models:
-            vertices = model.mesh_at(model.lod_max)[0]
-            self.diagonals.append(float(np.linalg.norm(np.ptp(vertices, axis=0))))
+        self.diagonals = [diagonal_of(model) for model in scene.models]
 
     def mesh(self, model: int, lod: int):
         """Return vertices (v, 3), faces (f, 3) and face ids (f,), rising, of a model by index."""
@@ -49,10 +43,6 @@ class MeshCache:
         while self._faces > CACHED_FACES and len(self._kept) > 1:
             self._faces -= len(self._kept.pop(next(iter(self._kept)))[1])
         return found
-
-    def count(self, model: int, lod: int) -> int:
-        """Return the active faces of a model at a LOD."""
-        return len(self.mesh(model, lod)[1])
 
 
 def mesh_keys(scene: Scene, lods) -> np.ndarray:

@@ -1,6 +1,8 @@
 """Checks of what a caller hands in: one clear error that names what and where, before anything is changed."""
 
+import inspect
 import os
+import warnings
 
 import numpy as np
 import warp as wp
@@ -12,12 +14,8 @@ _started_in: int | None = None
 def check_device(device, what: str | None = None):
     """Refuse a device that cannot be used in this process, or where a graph is being captured.
 
-    Args:
-        what: A call that waits for the device or allocates, which no graph can capture; None for a launch.
-
-    Raises:
-        RuntimeError: The device is a GPU and the process was forked from one that had started Warp; or a graph is
-            being captured.
+    Raises RuntimeError for a GPU in a process forked from one that had started Warp; and while a graph is captured, if
+    `what` is a call that no graph can capture, as it waits for the device or allocates; None is a launch.
     """
     global _started_in
     if _started_in is None:
@@ -83,12 +81,9 @@ def is_device_array(values) -> bool:
 
 
 def to_numpy(values, what: str) -> np.ndarray:
-    """Return an array of any framework, or a sequence, as a NumPy array of real numbers.
+    """Return an array of any framework, or a sequence, as a NumPy array of real numbers; raise ValueError for another.
 
     What lies on a GPU is copied. (synchronization point)
-
-    Raises:
-        ValueError: It is no array of numbers.
     """
     try:
         if isinstance(values, list | tuple | np.ndarray):
@@ -114,12 +109,16 @@ def first_line(error) -> str:
     return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
-def whole_number(value, what: str, low: int, high: int) -> int:
-    """Return a whole number from low to high as int.
+def warn_caller(message: str, category: type[Warning] = RuntimeWarning):
+    """Warn at the line that called the library."""
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and frame.f_globals.get("__name__", "").startswith("warp_abtree."):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)
 
-    Raises:
-        ValueError: It is none, or outside.
-    """
+
+def whole_number(value, what: str, low: int, high: int) -> int:
+    """Return a whole number from low to high as int; raise ValueError for another value."""
     number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
     if not number or value != value or value in (float("inf"), float("-inf")) or int(value) != value:
         raise ValueError(f"{what} {value!r} is not a whole number")
@@ -129,11 +128,7 @@ def whole_number(value, what: str, low: int, high: int) -> int:
 
 
 def finite_array(values, what: str, shape: tuple) -> np.ndarray:
-    """Return finite numbers of a shape as float64.
-
-    Raises:
-        ValueError: Another shape, or a number that is not finite.
-    """
+    """Return finite numbers of a shape as float64; raise ValueError for another shape or number."""
     array = to_numpy(values, what).astype(np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         wanted = "a finite number" if shape == () else f"{' by '.join(map(str, shape))} finite numbers"
@@ -142,11 +137,7 @@ def finite_array(values, what: str, shape: tuple) -> np.ndarray:
 
 
 def positive(value, what: str) -> float:
-    """Return a finite number above 0 as float.
-
-    Raises:
-        ValueError: It is none.
-    """
+    """Return a finite number above 0 as float; raise ValueError for another value."""
     number = float(finite_array(value, what, ()))
     if not number > 0:
         raise ValueError(f"{what} {value!r} is not above 0")
@@ -154,24 +145,19 @@ def positive(value, what: str) -> float:
 
 
 def flag(value, what: str) -> bool:
-    """Return a bool as such.
-
-    Raises:
-        ValueError: It is none.
-    """
+    """Return a bool as such; raise ValueError for another value."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{what} {value!r} is neither True nor False")
     return bool(value)
 
 
-def broadcast_rows(values, what: str, shape: tuple) -> np.ndarray:
-    """Return a copy of numbers as float64, broadcast to a shape: one row, or number, serves all objects.
-
-    Raises:
-        ValueError: It does not broadcast.
-    """
+def broadcast_rows(values, what: str, shape: tuple, is_finite=True) -> np.ndarray:
+    """Return finite numbers, or any if told, as float64 broadcast to a shape, a copy; raise ValueError for others."""
     values = np.asarray(values, np.float64)
     try:
-        return np.broadcast_to(values, shape).copy()
+        rows = np.broadcast_to(values, shape).copy()
     except ValueError:
         raise ValueError(f"{what}: shape {values.shape} does not stretch to {shape}") from None
+    if is_finite and not np.isfinite(rows).all():
+        raise ValueError(f"{what}: a number is not finite")
+    return rows

@@ -24,14 +24,7 @@ def atomic_write(path, mode="wb", **options):
 
     The file is written beside the path under a name of its own, so that several processes may write one path: the last
     one to finish wins, and a reader sees one of them whole. What stood there stays if anything fails, and so does
-    a pipe or a device.
-
-    Args:
-        mode: "wb" or "w".
-        options: As for `open`.
-
-    Raises:
-        OSError: The file cannot be written; it names the path that was asked for.
+    a pipe or a device. Options are those of `open`. Raises OSError with the path that was asked for.
     """
     path, file = Path(path), None
     if is_special(path):
@@ -113,8 +106,7 @@ def is_special(path) -> bool:
 def find_partial(folder, names) -> list[Path]:
     """Return the files in a folder that are half-written ones of `atomic_write` by their names, or were.
 
-    Args:
-        names: Compiled pattern of the whole names of what is written there. Other programs may call files ".partial".
+    Other programs may call files ".partial": `names` is a compiled pattern of the whole names of what is written there.
     """
     found = []
     for entry in os.scandir(folder):

@@ -17,13 +17,7 @@ def core_count() -> int:
 
 
 def cores_for(count: int, least: int, rooms: int) -> int:
-    """Return how many cores share a launch.
-
-    Args:
-        count: Items that they share.
-        least: Items that make a further core worth its while.
-        rooms: Cores that there is memory for.
-    """
+    """Return how many cores share `count` items, of `least` or more each; there is memory for `rooms`."""
     return max(1, min(current_regime().cpu_threads or rooms, rooms, count // least))
 
 
@@ -80,14 +74,10 @@ class _Share:
 
 
 def launch_on_cores(launch, cores):
-    """Launch a kernel on several threads of the CPU, which share its items; waits for them.
+    """Launch a kernel that is loaded on several threads of the CPU, the calling one too, which share its items; waits.
 
     Each thread of the kernel takes one item after the other until there are none. It writes what belongs to its item
     alone, or with true atomics: Warp's own are none on the CPU.
-
-    Args:
-        launch: Launches a kernel that is loaded, one thread of it.
-        cores: How many, the calling one too.
     """
     if cores == 1:
         launch()

@@ -16,8 +16,5 @@ def device_lock(device):
 
     `wp.array.numpy` makes the null stream a device's current one for a moment (Warp 1.19), so that two threads on one
     GPU would launch on each other's streams, and could leave that one behind, on which no graph can be captured.
-
-    Args:
-        device: `wp.Device`.
     """
     return _locks.setdefault(device.alias, threading.RLock()) if device.is_cuda else contextlib.nullcontext()

@@ -27,13 +27,11 @@ def _new_kernels(device, kernels) -> deque:
 def loading(device, kernels, busy: int = 0):
     """Load kernels beside what is done inside, and end when all are loaded; each is loaded once in a process.
 
+    Raises what the compiler says, as a launch would.
+
     Args:
-        device: Of the launches, `wp.Device`.
         kernels: The kernel and the block size of each launch, those first that take longest.
         busy: Cores that other threads keep busy, as `compiling_ahead` says.
-
-    Raises:
-        Exception: What the compiler says, as a launch would.
     """
     new = _new_kernels(device, kernels)
     threads = min(LOADING_THREADS["cpu" if device.is_cpu else "cuda"], core_count() - 1 - busy, len(new))

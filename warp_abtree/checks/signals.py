@@ -9,10 +9,7 @@ DELAY = 0.05  # seconds after which a signal comes again
 
 
 def not_swallowed(handler):
-    """Return a handler that lets a signal come again until no import and no `__del__` runs.
-
-    These swallow what a handler raises.
-    """
+    """Return a handler that lets a signal come again until no import and no `__del__` runs: these swallow errors."""
 
     def handle(number, frame):
         caller = frame

@@ -1,15 +1,29 @@
-"""Numbers that the host brings to a device again and again."""
+"""Arrays that the host makes on a device: those of structs, and numbers that it brings there again and again."""
 
 import numpy as np
 import warp as wp
 
 
-class Upload:
-    """An array on a device, and memory of the host that is copied there without waiting.
+def struct_of(struct, device, **values):
+    """Return a struct with arrays on a device of the types that its fields have; those that are not given are empty."""
+    made = struct()
+    for name, rows in values.items():
+        dtype = struct.vars[name].type.dtype
+        setattr(made, name, wp.array(np.ascontiguousarray(rows), dtype=dtype, device=device))
+    return made
 
-    Args:
-        count: Numbers, float64.
-        device: Device of the array; on the CPU both are the same.
+
+def zeros_of(struct, rows, columns, device):
+    """Return a struct of device arrays that are 0: `rows` entries each, or rows and columns."""
+    made = struct()
+    for name, variable in struct.vars.items():
+        shape = rows if variable.type.ndim == 1 else (rows, columns)
+        setattr(made, name, wp.zeros(shape, dtype=variable.type.dtype, device=device))
+    return made
+
+
+class Upload:
+    """Numbers on a device, float64, and memory of the host that is copied there without waiting; on the CPU one array.
 
     Attributes:
         array: Device float64 (count,), 0 at first.

@@ -6,9 +6,9 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, wrap_array
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.kernels.io import pipeline as kernels
-from warp_abtree.scene.poses import QUATERNION_TOLERANCE
 from warp_abtree.state.device_update import NO_FAULTS
 from warp_abtree.state.generation import STALE_GRAPH, LaunchGuard
+from warp_abtree.state.poses import QUATERNION_TOLERANCE
 
 
 class PoseInput(DeviceMemory):
@@ -16,9 +16,6 @@ class PoseInput(DeviceMemory):
 
     It is to `Query` and `ContactQuery` what `Pipeline.poses` is to a frame. `launch()` only launches, so that a CUDA
     graph can capture it.
-
-    Args:
-        scene: `Scene` with all its objects.
 
     Attributes:
         poses: x y z qx qy qz qw [world units, unit quaternion], device float64 (n, 7); initially those of the scene.

@@ -9,7 +9,7 @@ from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.interop.collision_data import ContactData, DistanceData
 from warp_abtree.interop.placed_shapes import PlacedShapes, shape_of
-from warp_abtree.scene.poses import check_poses
+from warp_abtree.state.poses import check_poses
 
 EXTERNAL = "__external"  # trimesh's name for a mesh that is not in the manager
 FIRST_PAIRS = 64  # tested first if one collision is enough
@@ -25,19 +25,20 @@ class CollisionManager(DeviceMemory):
     """Named, posed meshes and their collisions: a drop-in replacement for trimesh.collision.CollisionManager.
 
     Names, signatures and the shapes of results are trimesh's: what is asked for beside an answer makes a tuple of it.
-    Closed meshes are solids, all others surfaces.
-    Differences:
+    Collisions have a set of names or of pairs of them, and a list of `ContactData`; distances the names of the nearest
+    pair, and a `DistanceData`, both None where there is no pair. All of them wait for the device. Closed meshes are
+    solids, all others surfaces. Differences:
 
     * Answers are exact for the given poses (FCL rounds those of `add_object` to float32 and tests convex meshes
       iteratively). Touching is a collision. What lies inside any closed mesh collides with it, not only inside a convex
       one.
     * A contact is a pair of intersecting faces with their indices, also of convex meshes. Its depth is that of the pair
       of objects if one is a solid that holds points of the other: how far the deepest of these is from the surface
-      (`warp_abtree.query.distance`); else how deep the two faces are in one another. An object wholly inside a solid
+      (`query.stages.distance`); else how deep the two faces are in one another. An object wholly inside a solid
       gives one contact, whose segment joins that deepest point and the surface.
-    * Distances are negative where solids are deep in one another, by that depth, a lower bound of the penetration
-      depth; 0 where surfaces merely intersect, infinite if there are no objects. They are exact to the rounding of
-      coordinates, for convex meshes too.
+    * Distances [world units] are negative where solids are deep in one another, by that depth, a lower bound of the
+      penetration depth; 0 where surfaces merely intersect, infinite if there are no objects. They are exact to the
+      rounding of coordinates, for convex meshes too.
     * Transforms must be rigid within 1e-6; an object of the same name is replaced; `add_object` returns nothing.
 
     Cost: meshes are prepared once for all managers, by content. The first call after `add_object` of a mesh without a
@@ -79,8 +80,7 @@ class CollisionManager(DeviceMemory):
     def _pairs_with(self, guests):
         """Add guests for the duration of one call: name, `Shape` and matrix of each, or a manager that has them.
 
-        Yields:
-            Pairs of slots (own, guest), and a function of an index that returns the pair's names.
+        Yields pairs of slots (own, guest), and a function of an index that returns the pair's names.
         """
         if not isinstance(guests, list | CollisionManager):
             raise TypeError(f"other_manager is a {type(guests).__name__}, not a warp_abtree.CollisionManager")
@@ -144,30 +144,22 @@ class CollisionManager(DeviceMemory):
     def set_transform(self, name, transform):
         """Set the transform of an object, rigid (4, 4) [world units].
 
-        Raises:
-            ValueError: No object has this name, or the transform is not rigid within 1e-6; nothing is changed.
+        Raises ValueError for no such object, or a transform that is not rigid within 1e-6, and changes nothing.
         """
         self._placed.move(self._slot(name), self._matrix(transform, name))
 
     # Collisions.
 
     def in_collision_single(self, mesh, transform=None, return_names=False, return_data=False):
-        """Return whether another mesh, given as for `add_object`, collides with any object. Waits for the device.
+        """Return whether another mesh, given as for `add_object`, collides with any object, and the names of these.
 
-        Args:
-            return_names: Return the names of those that it collides with too, a set.
-            return_data: Return the contacts too, a list of `ContactData`, in which the mesh is named "__external".
+        In contacts the mesh is named "__external".
         """
         any_hit, hits, contacts = self._collide_with(self._external(mesh, transform), return_names, return_data)
         return _join(any_hit, (return_names, {name for name, _ in hits}), (return_data, contacts))
 
     def in_collision_internal(self, return_names=False, return_data=False):
-        """Return whether any two objects collide. Waits for the device.
-
-        Args:
-            return_names: Return the pairs of names too, a set of tuples, each in alphabetical order.
-            return_data: Return the contacts too, a list of `ContactData`.
-        """
+        """Return whether any two objects collide, and the pairs of names, each in alphabetical order."""
         name_of = {slot: name for name, slot in self._slots.items()}
         self._placed.upload()
         scene = self._placed.scene
@@ -180,14 +172,9 @@ class CollisionManager(DeviceMemory):
         return _join(any_hit, (return_names, {tuple(sorted(names)) for names in hits}), (return_data, contacts))
 
     def in_collision_other(self, other_manager, return_names=False, return_data=False):
-        """Return whether any object collides with one of another manager, of any device. Waits for the device.
+        """Return whether any object collides with one of another manager, of any device.
 
-        Args:
-            return_names: Return the pairs of names too, a set of tuples (name here, name there).
-            return_data: Return the contacts too, a list of `ContactData`.
-
-        Raises:
-            TypeError: Not a `CollisionManager` of this library.
+        Pairs are (name here, name there). Raises TypeError for what is no `CollisionManager` of this library.
         """
         any_hit, hits, contacts = self._collide_with(other_manager, return_names, return_data)
         return _join(any_hit, (return_names, set(hits)), (return_data, contacts))
@@ -195,30 +182,15 @@ class CollisionManager(DeviceMemory):
     # Distances.
 
     def min_distance_single(self, mesh, transform=None, return_name=False, return_data=False):
-        """Return the distance [world units] of another mesh, given as for `add_object`, from the nearest object.
-
-        0 or less if they collide, infinite without objects. Waits for the device.
-
-        Args:
-            return_name: Return the nearest object's name too; None if there is none.
-            return_data: Return a `DistanceData` too; None if there is none.
-        """
+        """Return the distance of another mesh, given as for `add_object`, from the nearest object, and its name."""
         with self._pairs_with(self._external(mesh, transform)) as (pairs, names):
             distance, pair, data = self._nearest(pairs, names)
         return _join(distance, (return_name, pair and pair[0]), (return_data, data))
 
     def min_distance_internal(self, name=None, return_names=False, return_data=False):
-        """Return the least distance [world units] of two objects, or of one from the others. Waits for the device.
+        """Return the least distance of two objects, or of a named one from the others, and their sorted names.
 
-        0 or less if they collide, infinite without two objects.
-
-        Args:
-            name: One of the two objects; None for any.
-            return_names: Return the two names too, a tuple in alphabetical order; None without two objects.
-            return_data: Return a `DistanceData` too; None without two objects.
-
-        Raises:
-            ValueError: No object has this name.
+        Raises ValueError if no object has this name.
         """
         names, own = self._own()
         i, j = np.triu_indices(len(own), 1)
@@ -229,16 +201,9 @@ class CollisionManager(DeviceMemory):
         return _join(distance, (return_names, pair and tuple(sorted(pair))), (return_data, data))
 
     def min_distance_other(self, other_manager, return_names=False, return_data=False):
-        """Return the least distance [world units] of an object from one of another manager. Waits for the device.
+        """Return the least distance of an object from one of another manager, and (name here, name there).
 
-        0 or less if they collide, infinite without two objects.
-
-        Args:
-            return_names: Return the names too, a tuple (name here, name there); None if a manager is empty.
-            return_data: Return a `DistanceData` too; None if a manager is empty.
-
-        Raises:
-            TypeError: Not a `CollisionManager` of this library.
+        Raises TypeError for what is no `CollisionManager` of this library.
         """
         with self._pairs_with(other_manager) as (pairs, names):
             distance, pair, data = self._nearest(pairs, names)
@@ -281,11 +246,7 @@ class CollisionManager(DeviceMemory):
             return self._collide(pairs[kept], named, return_data, not (return_names or return_data))
 
     def _collide(self, pairs, names, return_data, first_only=False):
-        """Return whether any pair collides, names of those that do, and their contacts if requested.
-
-        Args:
-            first_only: Whether one collision is enough.
-        """
+        """Return whether any pair collides, or the first do, names of those that do, and contacts if requested."""
         if first_only and len(pairs) > FIRST_PAIRS:
             first = self._collide(pairs[:FIRST_PAIRS], names[:FIRST_PAIRS], return_data)
             return first if first[0] else self._collide(pairs[FIRST_PAIRS:], names[FIRST_PAIRS:], return_data)

@@ -7,7 +7,7 @@ pairs, and is deterministic.
 
 As Newton has it, two shapes have contacts where their distance is under the sum of both margins and both gaps
 (`ShapeConfig`), and rest with both margins between them. Newton's own gap of 0.1 m a shape makes very many contacts of
-fine meshes: give one that bodies move in a step. Depths and normals are those of `warp_abtree.query.manifold`. Pairs of
+fine meshes: give one that bodies move in a step. Depths and normals are those of `query.stages.points`. Pairs of
 shapes of which one is no mesh, and particles, are passed to a pipeline of Newton's, whose contacts come first. Tested
 with Newton 1.8 (extra `newton`), which calls its contacts experimental.
 """
@@ -21,8 +21,8 @@ from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.kernels.io import newton as kernels
 from warp_abtree.model.model import Model
 from warp_abtree.model.winding import keep_outside
-from warp_abtree.query.manifold import POINTS_MAX, ManifoldQuery
 from warp_abtree.query.request import CapacityError
+from warp_abtree.query.stages.points import POINTS_MAX, ManifoldQuery
 from warp_abtree.scene.scene import Scene
 
 # Pairs of other shapes that there is room for by default.
@@ -80,10 +80,7 @@ def _excluded_pairs(model, shapes):
 
 
 def _other_pairs(model, is_mesh, collide):
-    """Return the pairs of shapes that collide and are not both meshes, (k, 2), sorted; k is linear in the meshes.
-
-    Newton's own list of pairs has all pairs of meshes too.
-    """
+    """Return the pairs of shapes that collide and are not both meshes, as Newton's own list has, (k, 2), sorted."""
     names = ("shape_body", "shape_collision_group", "shape_world")
     body, group, world = (np.asarray(getattr(model, name).numpy(), np.int64) for name in names)
     collide = collide & (group != 0)

@@ -58,12 +58,8 @@ def shape_of(mesh, name) -> Shape:
 class PlacedShapes:
     """Posed shapes; the slot of a removed one is reused for the next of the same mesh: models stay on the device.
 
-    Args:
-        device: Warp device.
-        solids: Whether closed shapes are solids.
-
     Attributes:
-        scene: `Scene` with one object per slot.
+        scene: `Scene` with one object per slot; closed shapes are solids where asked.
         shapes: `Shape` of each slot.
         poses: Matrices of the slots [world units], float64 (at least as many as slots, 4, 4).
     """
@@ -108,14 +104,10 @@ class PlacedShapes:
             self.scene.set_poses(self.poses[: self.scene.object_count])
             self._moved = False
 
-    def _model_boxes(self):
-        boxes = np.array([(shape.middle, shape.half) for shape in self.shapes]).reshape(-1, 2, 3)
-        return boxes[:, 0], boxes[:, 1]
-
     def boxes(self):
         """Return centres and half extents of all boxes in the world, (n, 3) each, rounded outwards."""
         poses = self.poses[: len(self.shapes)]
-        middle, half = self._model_boxes()
+        middle, half = np.array([(shape.middle, shape.half) for shape in self.shapes]).reshape(-1, 2, 3).swapaxes(0, 1)
         rotation, position = poses[:, :3, :3], poses[:, :3, 3]
         size = np.linalg.norm(middle, axis=1) + np.linalg.norm(half, axis=1)
         skew = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0)

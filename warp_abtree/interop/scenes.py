@@ -9,8 +9,8 @@ from warp_abtree.model.files.found import FileSurface, Remarks
 from warp_abtree.model.files.read import USD, read_file, split_file_name
 from warp_abtree.model.mesh import MeshError, load_mesh
 from warp_abtree.model.model import Model
-from warp_abtree.scene.poses import RIGID_TOLERANCE
 from warp_abtree.scene.scene import Scene
+from warp_abtree.state.poses import RIGID_TOLERANCE
 
 # Stretches within this relative difference share a model.
 STRETCH_TOLERANCE = 1e-9

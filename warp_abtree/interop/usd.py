@@ -17,10 +17,8 @@ def read_usd(path, remarks):
     """Return a stage at its first time as a trimesh.Scene, with the prim's path for the name of each node.
 
     Prims that are geometry but cannot be read, are invisible, or of another purpose than default or render, are left
-    out; subdivision is not carried out, and skins are taken at rest. The `Remarks` name all of these.
-
-    Raises:
-        MeshError: usd-core is missing, the file cannot be read, or a mesh is damaged.
+    out; subdivision is not carried out, and skins are taken at rest. The `Remarks` name all of these. Raises MeshError
+    where usd-core is missing, the file cannot be read, or a mesh is damaged.
     """
     try:
         from pxr import Tf, Usd
@@ -58,12 +56,7 @@ class _StageReader:
         self._known: dict[tuple, str] = {}
 
     def visit(self, root, prefix, transform_of):
-        """Add what lies under a prim.
-
-        Args:
-            prefix: Of the names of nodes.
-            transform_of: Returns where a prim is in the world, a matrix of USD.
-        """
+        """Add what lies under a prim, nodes named with a prefix, where `transform_of` each is, a matrix of USD."""
         from pxr import Usd, UsdGeom
 
         prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies()))
@@ -156,26 +149,22 @@ def _make_shape(prim, time):
         return prim.GetAttribute(name).Get(time)
 
     kind = prim.GetTypeName()
-    if kind == "Cube":
-        mesh = creation.box(extents=[get("size")] * 3)
-    elif kind == "Sphere":
-        mesh = creation.icosphere(subdivisions=SUBDIVISIONS, radius=get("radius"))
-    elif kind == "Cylinder":
-        mesh = creation.cylinder(radius=get("radius"), height=get("height"), sections=SECTIONS)
-    elif kind == "Cone":
-        mesh = creation.cone(radius=get("radius"), height=get("height"), sections=SECTIONS)
-    elif kind == "Capsule":
-        mesh = creation.capsule(radius=get("radius"), height=get("height"), count=(SECTIONS, SECTIONS))
-    elif kind == "Plane":
+    if kind == "Plane":
         return _make_plane(get("width") / 2, get("length") / 2, get("axis"))
-    else:
+    makers = {
+        "Cube": lambda: creation.box(extents=[get("size")] * 3),
+        "Sphere": lambda: creation.icosphere(subdivisions=SUBDIVISIONS, radius=get("radius")),
+        "Cylinder": lambda: creation.cylinder(radius=get("radius"), height=get("height"), sections=SECTIONS),
+        "Cone": lambda: creation.cone(radius=get("radius"), height=get("height"), sections=SECTIONS),
+        "Capsule": lambda: creation.capsule(radius=get("radius"), height=get("height"), count=(SECTIONS, SECTIONS)),
+    }
+    if kind not in makers:
         return None
+    mesh = makers[kind]()
     vertices = np.asarray(mesh.vertices, np.float64)
     # Of USD all have their middle at the origin.
     vertices = vertices - (vertices.min(0) + vertices.max(0)) / 2
-    return vertices[:, AXIS_COLUMNS[get("axis")] if prim.HasAttribute("axis") else AXIS_COLUMNS["Z"]], np.asarray(
-        mesh.faces
-    )
+    return vertices[:, AXIS_COLUMNS[get("axis") if prim.HasAttribute("axis") else "Z"]], np.asarray(mesh.faces)
 
 
 def _make_plane(width, length, axis):

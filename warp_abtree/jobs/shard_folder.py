@@ -39,7 +39,7 @@ class ShardFolder:
     """
 
     def __init__(self, out, job):
-        self.path, self.unit = Path(out), job.unit
+        self.path = Path(out)
         known = json.loads(json.dumps({**job.describe(), "file": "npz"}))
         self.manifest = {"format": SHARD_FORMAT, "version": SHARD_VERSION, "hash": _hash_job(known), "job": known}
         self.left = dict.fromkeys(_ranges(known))
@@ -49,12 +49,8 @@ class ShardFolder:
     def open(self, progress):
         """Make the folder, or check the shards that it holds of this job.
 
-        Args:
-            progress: Called as progress("check", done, total) after each existing shard.
-
-        Raises:
-            ValueError: It holds another job, or a shard of another, or something else. Nothing is changed.
-            OSError: A shard cannot be read.
+        Calls progress("check", done, total) after each. Raises ValueError where it holds another job, a shard of one,
+        or something else, and changes nothing; OSError where a shard cannot be read.
         """
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"{self.path}: is a file")
@@ -82,12 +78,7 @@ class ShardFolder:
             progress("check", done, len(shards))
 
     def write(self, start, stop, columns):
-        """Write the shard of a range.
-
-        Raises:
-            RuntimeError: The columns are not those of the range.
-            OSError: The file cannot be written.
-        """
+        """Write the shard of a range; raise RuntimeError for columns of another, OSError where it cannot be written."""
         job = self.manifest["job"]
         intersecting = sum(_count_poses(job, name, values) for name, values in columns.items())
         fault = _row_fault(job, {len(values) for values in columns.values()}, start, stop)
@@ -136,10 +127,7 @@ def read_shards(out) -> Iterator[tuple[int, int, dict]]:
 def _read_shard(path, manifest, start, stop, read=lambda name, values: values) -> dict:
     """Check a shard and return its columns, or what `read` makes of each.
 
-    Raises:
-        DamagedShard: It is not what was written for this range.
-        ValueError: It is of another job.
-        OSError: It cannot be opened.
+    Raises DamagedShard for what was not written for this range, ValueError for another job's, OSError.
     """
     stamp, columns, rows, digest = {}, {}, set(), hashlib.sha256()
     with open(path, "rb") as file:
@@ -220,11 +208,7 @@ def _shard_name(start, stop) -> str:
 
 
 def _find_shards(path, job) -> dict[tuple[int, int], Path]:
-    """Return the file of each range that has one, in order.
-
-    Raises:
-        ValueError: A shard's name is not one of the job.
-    """
+    """Return the file of each range that has one, in order; raise ValueError for a name that is not the job's."""
     held = {entry.name for entry in path.iterdir() if SHARD_NAME.fullmatch(entry.name) and not is_special(entry)}
     names = {part: _shard_name(*part) for part in _ranges(job)}
     for other in sorted(held.difference(names.values())):

@@ -10,9 +10,9 @@ import numpy as np
 from warp_abtree.checks.arguments import to_numpy, whole_number
 from warp_abtree.model.model import Model
 from warp_abtree.query.request import check_request
-from warp_abtree.scene.poses import check_poses
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep import sweep
+from warp_abtree.state.poses import check_poses
 
 # Poses of a shard, and rows read at a time while a job is checked.
 READ_ROWS = SHARD = 65536
@@ -86,8 +86,6 @@ class SweepJob:
         TypeError: model_a or model_b is no Model.
         ValueError: Bad poses or LODs (the message names the first), or an unknown option.
     """
-
-    unit = "pose"
 
     def __init__(self, model_a, model_b, poses, lods=None, output="any", precision="exact", shard=SHARD):
         for model in (model_a, model_b):

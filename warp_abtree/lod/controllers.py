@@ -222,11 +222,7 @@ class ToleranceController(Controller):
 
 
 def check_loosest(loosest) -> float:
-    """Return the most that a tolerance is loosened, at least 1.
-
-    Raises:
-        ValueError: It is below 1 or not finite.
-    """
+    """Return the most that a tolerance is loosened; raise ValueError unless it is finite and at least 1."""
     if not positive(loosest, "loosest") >= 1:
         raise ValueError(f"loosest {loosest!r} is below 1")
     return float(loosest)

@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-import warp as wp
 
+from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.lod import prediction
 from warp_abtree.kernels.lod.ladder import LodPool
 from warp_abtree.state.device_update import shares_levels
@@ -26,20 +26,18 @@ def lod_pool(ladder: Ladder, scene) -> LodPool:
     levels = np.stack([(error > tolerances[:, None]).sum(1) for error in ladder.error])
     levels[:, 0] = 0
     shared = shares_levels(scene.object_model, ladder.levels())
-    pool = LodPool()
-    for name, values in (
-        ("object_model", scene.object_model),
-        ("importance", scene.object_importance),
-        ("lod", ladder.lod),
-        ("error", ladder.error),
-        ("faces", ladder.faces),
-        ("entry", ladder.entry),
-        ("face_count", [model.face_count for model in ladder.models]),
-        ("refits", ~shared),
-        ("tolerance_level", levels),
-    ):
-        dtype, real = (wp.float64, np.float64) if name == "error" else (wp.int32, np.int32)
-        array = np.ascontiguousarray(values, real).ravel()
-        setattr(pool, name, wp.array(array, dtype=dtype, device=scene.device))
+    pool = struct_of(
+        LodPool,
+        scene.device,
+        object_model=scene.object_model,
+        importance=scene.object_importance,
+        lod=ladder.lod.ravel(),
+        error=ladder.error.ravel(),
+        faces=ladder.faces.ravel(),
+        entry=ladder.entry.ravel(),
+        face_count=[model.face_count for model in ladder.models],
+        refits=~shared,
+        tolerance_level=levels.ravel(),
+    )
     pool.level_count, pool.tolerance_count = ladder.steps + 1, len(tolerances)
     return pool

@@ -96,8 +96,7 @@ class Timer:
     def mark(self, stage: str, count=dict):
         """End a part of a stage, which may have several. (synchronization point without events)
 
-        Args:
-            count: Returns the counted work of that part by name; called for a clock that takes it.
+        `count` returns the counted work of that part by name; it is called for a clock that takes it.
         """
         if self.device.is_capturing and not self.uses_events:
             return
@@ -105,11 +104,6 @@ class Timer:
         if self.counts_work:
             self.clock.charge(**count())
         self._read()
-
-    def close(self, stage: str):
-        """End a stage, unless it was the last that ended."""
-        if self.marks[-1] != stage:
-            self.mark(stage)
 
     def _read(self):
         if not self.uses_events:

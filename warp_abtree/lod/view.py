@@ -110,11 +110,7 @@ class View:
         self.batch.check("selection")
 
     def launch(self):
-        """Measure, in one launch.
-
-        Raises:
-            RuntimeError: The scene's objects changed.
-        """
+        """Measure, in one launch; raise RuntimeError where the scene's objects changed."""
         self.check()
         pool = self.batch.objects.pool
         inputs = [pool.rotation, pool.position, self._arrays]

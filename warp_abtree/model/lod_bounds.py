@@ -24,9 +24,7 @@ ERROR_KERNELS = [(hausdorff_bound.replay_merges_kernel, 1)]
 def certify_errors(vertices, faces, parent, merged):
     """Return the certified errors of all LODs [model units], float64 [m+1], of a forest and the positions it merges to.
 
-    Args:
-        parent: vertex_parent int32 [n_v+m].
-        merged: Positions of the nodes that merges make [model units], float64 [m, 3].
+    The forest is vertex_parent, int32 [n_v+m]; positions of the nodes that merges make [model units], float64 [m, 3].
     """
     with loading(wp.get_device("cpu"), ERROR_KERNELS):
         bounds = LodBounds(vertices, faces)
@@ -57,7 +55,11 @@ class LodBounds:
         self.replay = _new_replay(self._pos, face_count)
         self.replay.rings = linked_rings(faces, face_array, 2 * len(vertices))
         launch(hausdorff_bound.start_replay_kernel, face_count, face_array, self.replay)
-        self._covers = _new_covers(self.replay)
+        self._covers, rows = triangle_cover.Covers(), triangle_cover.COVERS_AT_ONCE
+        self._covers.triangle, self._covers.first = self.replay.queue, self.replay.queue_face
+        self._covers.near, self._covers.count = self.replay.scratch.near, filled(rows, 0)
+        self._covers.face = filled((rows, triangle_cover.SLOTS), 0)
+        self._covers.limit = wp.zeros(rows, dtype=wp.float64, device="cpu")
         self._pair = filled((len(vertices), 2), 0)
         self._bound_sq = wp.zeros(len(vertices), dtype=wp.float64, device="cpu")
         self._state = self.replay.counter.numpy()  # shares the memory
@@ -104,14 +106,6 @@ def _new_replay(pos, face_count):
     replay.free_slot = unwritten(pooled)
     replay.bvh_face = filled(1, 0)
     return replay
-
-
-def _new_covers(replay):
-    covers, rows = triangle_cover.Covers(), triangle_cover.COVERS_AT_ONCE
-    covers.triangle, covers.first, covers.near = replay.queue, replay.queue_face, replay.scratch.near
-    covers.count, covers.face = filled(rows, 0), filled((rows, triangle_cover.SLOTS), 0)
-    covers.limit = wp.zeros(rows, dtype=wp.float64, device="cpu")
-    return covers
 
 
 def _index(replay):

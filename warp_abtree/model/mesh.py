@@ -23,29 +23,17 @@ COORDINATE_MAX = 2.0**300  # products of three stay finite
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A welded triangle mesh.
+    """A welded triangle mesh, its vertices and faces in the order of the source."""
 
-    Attributes:
-        vertices: Positions [model units], float64, shape [v, 3]; distinct, referenced, in the order of the source.
-        faces: Corners, int32, shape [n_f, 3]; in the order of the source.
-        dropped_faces: Faces without three distinct corners after welding, int32, ascending; they keep their index.
-        name: Name for people.
-        file_vertex_count: Vertices in the source.
-        unreferenced_count: Vertices of the source that no face refers to.
-        welded_count: Vertices that coincide with an earlier one and were merged into it.
-        remarks: What the file holds and was not read, in one line, empty if nothing.
-        parts: Of the source that were joined; `scene_from_file` makes an object of each.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    dropped_faces: np.ndarray
-    name: str
-    file_vertex_count: int
-    unreferenced_count: int
-    welded_count: int
-    remarks: str = ""
-    parts: int = 1
+    vertices: np.ndarray  # positions [model units], float64 (v, 3), distinct and referenced
+    faces: np.ndarray  # corners, int32 (n_f, 3)
+    dropped_faces: np.ndarray  # without three distinct corners after welding, int32, ascending; they keep their index
+    name: str  # for people
+    file_vertex_count: int  # vertices in the source
+    unreferenced_count: int  # of these, those that no face refers to
+    welded_count: int  # and those that coincide with an earlier one and were merged into it
+    remarks: str = ""  # what the file holds and was not read, in one line, empty if nothing
+    parts: int = 1  # of the source that were joined; `scene_from_file` makes an object of each
 
 
 def load_mesh(source, name=None):

@@ -3,7 +3,6 @@
 import hashlib
 import io
 import math
-import warnings
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -11,20 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line, whole_number
+from warp_abtree.checks.arguments import first_line, warn_caller, whole_number
 from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.kernels.base.poses import COORDINATE_MIN
 from warp_abtree.model.cache import LEAST_FACES, error_key, file_key, find_model, keep_errors, keep_model, mesh_key
 from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.files.unpack import exceeds_limit, limit_message
-from warp_abtree.model.mesh import (
-    COORDINATE_MAX,
-    EXTENT_LIMITS,
-    Mesh,
-    load_mesh,
-    mesh_from_arrays,
-    orient_mesh,
-)
+from warp_abtree.model.mesh import COORDINATE_MAX, EXTENT_LIMITS, Mesh, load_mesh, mesh_from_arrays, orient_mesh
 from warp_abtree.model.outward_error import OutwardError
 from warp_abtree.model.progressive import ProgressiveMesh, build_progressive
 from warp_abtree.model.tree import Tree, active_build
@@ -124,16 +116,8 @@ class Model:
 
     @classmethod
     def from_arrays(
-        cls,
-        vertices,
-        faces,
-        base_faces: int = 10,
-        progress=None,
-        name: str = "arrays",
-        cache: bool = True,
-        orient: bool = False,
-        certify: bool = False,
-    ):
+        cls, vertices, faces, base_faces=10, progress=None, name="arrays", cache=True, orient=False, certify=False
+    ) -> "Model":
         """Build a model from vertices (v, 3) and faces (n, 3); see `load`."""
         return cls.load(mesh_from_arrays(vertices, faces, name=name), base_faces, progress, cache, orient, certify)
 
@@ -143,13 +127,13 @@ class Model:
         vertices = self.progressive.vertex_pos[: self.vertex_count]
         return find_winding(vertices, self.progressive.face_vertex, self.dropped_faces)
 
-    def warn_of_winding(self, why: str, stacklevel: int = 3):
-        """Warn where the winding is wrong, once a model, and say what depends on it."""
+    def warn_of_winding(self, why: str):
+        """Warn who called the library where the winding is wrong, once a model, and say what depends on it."""
         fault = self.winding.fault()
         if fault is not None and not self._warned:
             self._warned = True
             mend = "Model.load(orient=True) turns the faces"
-            warnings.warn(f"model {self.name!r}: {fault}; {why}; {mend}", RuntimeWarning, stacklevel=stacklevel)
+            warn_caller(f"model {self.name!r}: {fault}; {why}; {mend}")
 
     @cached_property
     def digest(self) -> str:
@@ -247,11 +231,7 @@ def _build(mesh, base_faces, progress, key, certify) -> Model:
 
 
 def _read(path, more=(), error_key=None) -> Model:
-    """Read a model file with more arrays, and check all of it; errors that it lacks lie in the cache by a key.
-
-    Raises:
-        ModelError: As `Model.open`.
-    """
+    """Read a model file with more arrays, and check all of it, as `Model.open`; the cache may have its errors."""
     names = (*_ARRAYS, *more, "leaf_node", "name")
     if path.is_dir() or (path.exists() and not path.is_file()):
         raise ModelError(f"{path}: is no regular file")

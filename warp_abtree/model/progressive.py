@@ -2,7 +2,6 @@
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -11,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
-from warp_abtree.checks.cpu_threads import core_count, wait_for, workers
+from warp_abtree.checks.cpu_threads import core_count, wait_for
 from warp_abtree.checks.kernel_loading import compiling_ahead, loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.build import active_build, vertex_forest
@@ -37,26 +36,16 @@ class ProgressiveMesh:
 
     Nodes 0..n_v-1 of the forest are the original vertices, node n_v+j is made by merge j; at `lod` the merges
     0..m-lod-1 are applied, and split i undoes merge m-1-i.
-
-    Attributes:
-        vertex_parent: Node that each node merges into, -1 at a root, shape [n_v+m].
-        vertex_pos: Positions [model units], shape [n_v+m, 3]; the first n_v are the original's, to the bit.
-        face_vertex: Original faces, shape [n_f, 3].
-        face_split: Face f is active iff lod >= face_split[f], m+1 for dropped faces; shape [n_f].
-        split_start: Where each split's slice of `split_face` begins, shape [m+1].
-        split_face: Slice i lists, ascending, every face that split i inserts or deforms.
-        known_error: `lod_error` where it was certified before, else None.
-        error_key: Key of the cache under which `lod_error` is kept once certified, None keeps none.
     """
 
-    vertex_parent: np.ndarray
-    vertex_pos: np.ndarray
-    face_vertex: np.ndarray
-    face_split: np.ndarray
-    split_start: np.ndarray
-    split_face: np.ndarray
-    known_error: np.ndarray | None = None
-    error_key: str | None = None
+    vertex_parent: np.ndarray  # node that each node merges into, -1 at a root, [n_v+m]
+    vertex_pos: np.ndarray  # positions [model units], [n_v+m, 3]; the first n_v are the original's, to the bit
+    face_vertex: np.ndarray  # original faces, [n_f, 3]
+    face_split: np.ndarray  # face f is active iff lod >= face_split[f], m+1 for dropped faces; [n_f]
+    split_start: np.ndarray  # where each split's slice of `split_face` begins, [m+1]
+    split_face: np.ndarray  # slice i lists, ascending, every face that split i inserts or deforms
+    known_error: np.ndarray | None = None  # `lod_error` where it was certified before
+    error_key: str | None = None  # of the cache under which `lod_error` is kept once certified; None keeps none
 
     @cached_property
     def lod_error(self) -> np.ndarray:
@@ -154,14 +143,11 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None, cer
     powers of two. It stops early only where every further merge would kill the last face.
 
     Args:
-        base_faces: Stop when no more faces than this are left, >= 1.
         progress: Called as progress(stage, done, total) between launches; stages "collapse" and "LOD bounds".
         then: Called once, by another thread while the collapse goes on or after it.
         certify: Whether to certify the error of every LOD beside the collapse, not when it is first read.
 
     Raises ValueError where base_faces is no whole number from 1, or the mesh has 2^29 vertices or 2^31 / 3 faces.
-
-    Source: Garland and Heckbert 1997 (collapse).
     """
     whole_number(base_faces, "base_faces", 1, 2**62)
     vertices, faces = np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
@@ -169,57 +155,40 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None, cer
         raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
     report = progress if progress is not None else lambda stage, done, total: None
     kernels = [*ERROR_KERNELS, *KERNELS] if certify else KERNELS
-    with ExitStack() as beside:
-        busy = beside.enter_context(compiling_ahead(len(faces)))
+    with compiling_ahead(len(faces)) as busy:
         with loading(wp.get_device("cpu"), kernels, busy):
             collapse = Collapse(vertices, faces, int(base_faces))
-        run = _certify_beside if certify else _collapse_alone
-        merged, errors = run(collapse, vertices, faces, report, then)
+        merged, errors = _collapse(collapse, vertices, faces, report, then, certify)
         parent = collapse.parents()
         pos = np.concatenate([vertices, *merged])
         face_split, split_start, split_face = _splits(parent, faces, len(vertices))
         return ProgressiveMesh(parent, pos, faces, face_split, split_start, split_face, errors)
 
 
-def _thread_count():
-    return current_regime().cpu_threads or core_count()
+def _collapse(collapse, vertices, faces, report, then, certify):
+    """Run a collapse, beside `then` or, to certify, the bounds of its merges where there is a core for them.
 
-
-def _collapse_alone(collapse, vertices, faces, report, then):
-    """Run a collapse, and `then` beside it where there is a core; return the merged positions in parts, no errors."""
+    Returns the positions that merges make [model units], in parts, and the certified errors, None without.
+    """
+    jobs: list = []
     with ThreadPoolExecutor(1) as pool:
-        jobs = [pool.submit(then)] if _thread_count() > 1 else []
         try:
-            for removed in collapse.steps():
-                report("collapse", removed, collapse.goal)
+            if (current_regime().cpu_threads or core_count()) > 1:
+                jobs.append(pool.submit((lambda: then() if collapse.run() else None) if certify else then))
+            if not (jobs and certify):
+                for removed in collapse.steps():
+                    report("collapse", removed, collapse.goal)
+            if certify:
+                bounds = LodBounds(vertices, faces)
+                merged = _follow(collapse, bounds, report)
         finally:
+            collapse.stop()
             wait_for(jobs)
     if not jobs:
         then()
     for job in jobs:
         job.result()
-    merges, _, _ = collapse.follow(-1)
-    return [collapse.merged(0, merges)], None
-
-
-def _certify_beside(collapse, vertices, faces, report, then):
-    """Run a collapse and bound its merges, beside one another where there are cores; return positions and errors."""
-    if _thread_count() == 1:
-        for removed in collapse.steps():
-            report("collapse", removed, collapse.goal)
-        bounds = LodBounds(vertices, faces)
-        merged = _follow(collapse, bounds, report)
-        then()
-    else:
-        running = workers(1).submit(lambda: then() if collapse.run() else None)
-        try:
-            bounds = LodBounds(vertices, faces)
-            merged = _follow(collapse, bounds, report)
-        finally:
-            collapse.stop()
-            wait_for([running])
-        running.result()
-    return merged, bounds.errors()
+    return (merged, bounds.errors()) if certify else ([collapse.merged(0, collapse.follow(-1)[0])], None)
 
 
 def _follow(collapse, bounds, report):

@@ -15,17 +15,11 @@ from warp_abtree.model.mesh import FACE_LIMIT
 
 @dataclass(frozen=True)
 class Tree:
-    """Static topology of an AB-Tree over n faces.
+    """Static topology of an AB-Tree over n faces."""
 
-    Attributes:
-        leaf_node: Heap index of each face's leaf, the paper's indexed list, int32 (n,).
-        node_face: Face of each leaf node, -1 elsewhere, int32 (2^(depth+1),); the root is 1.
-        depth: ceil(log2 n).
-    """
-
-    leaf_node: np.ndarray
-    node_face: np.ndarray
-    depth: int
+    leaf_node: np.ndarray  # heap index of each face's leaf, the paper's indexed list, int32 (n,)
+    node_face: np.ndarray  # face of each leaf node, -1 elsewhere, int32 (2^(depth+1),); the root is 1
+    depth: int  # ceil(log2 n)
 
     @classmethod
     def from_leaves(cls, leaf_node: np.ndarray) -> "Tree":

@@ -22,6 +22,32 @@ from warp_abtree.state.generation import LaunchGuard
 EVERY_WORLD = -1
 
 
+class PosedBoxes:
+    """Boxes of objects where they stand, for a `BroadPhase`.
+
+    Args:
+        batch: `Batch` of the objects.
+
+    Attributes:
+        reach: By how much each object's box is wider on all sides [world units]: the length of x, y, z and w, device
+            vec4d (n,), read by each launch; (0,) for not at all.
+        wide: By how much all boxes are wider at least [world units].
+    """
+
+    def __init__(self, batch: Batch):
+        self._batch, self.wide = batch, 0.0
+        self.reach = wp.empty(0, dtype=wp.vec4d, device=batch.device)
+
+    def given(self) -> tuple:
+        """Return the numbers that they depend on, by which launches are recorded anew."""
+        return (self.wide,)
+
+    def make(self, launch, guard: LaunchGuard, lower, upper):
+        """Make the launch that writes lower and upper bounds of the boxes."""
+        inputs = [self._batch.trees, guard.record(), self.wide, self.reach, lower, upper]
+        return launch(pose_box_kernel, dim=len(lower), inputs=inputs, device=self._batch.device)
+
+
 class BroadPhase(DeviceMemory):
     """Broad phase of a batch: allocates once, launches many times.
 
@@ -29,26 +55,24 @@ class BroadPhase(DeviceMemory):
         capacity: Pairs that there is room for at first.
         sorts: Whether a launch sorts the pairs by their objects, so that nothing depends on the order in which it
             found them.
-        reach: By how much each object's box is wider on all sides [world units]: the length of x, y, z and w, device
-            vec4d (n,), read by each launch; None for not at all.
+        boxes: What boxes the objects, by default `PosedBoxes`.
+        guard: `LaunchGuard` of what launches it; None makes one.
 
     Attributes:
         pairs: (i, j), i < j, device vec2i (capacity,).
         key: i * 2^32 + j of each pair where they are sorted, device int64 (2 capacity,); the greatest int64 behind the
             last pair.
         pair_count: Pairs found, device int32 (1,); keeps counting past the capacity.
-        guard: `LaunchGuard` of what launches it; a query takes its own.
-        wide: By how much all boxes are wider at least [world units].
+        boxes: As given.
     """
 
     pairs: wp.array
     key: wp.array
     order: wp.array
 
-    def __init__(self, batch: Batch, capacity=None, sorts=False, reach: wp.array | None = None):
-        self.batch, self.sorts, self.wide = batch, sorts, 0.0
+    def __init__(self, batch: Batch, capacity=None, sorts=False, boxes=None, guard: LaunchGuard | None = None):
+        self.batch, self.sorts, self.boxes = batch, sorts, boxes or PosedBoxes(batch)
         self.device = device = batch.device
-        self._reach = wp.empty(0, dtype=wp.vec4d, device=device) if reach is None else reach
         check_device(device, "making a broad phase")
         count = batch.object_count
         worlds = batch.objects.pool.world.numpy()
@@ -61,28 +85,29 @@ class BroadPhase(DeviceMemory):
         self.excluded = wp.array(batch.excluded, dtype=wp.int64, device=device)
         self.collision_bits = batch.objects.collision_bits
         self.pair_count = wp.zeros(1, dtype=wp.int32, device=device)
-        self.guard = LaunchGuard(device, batch.states.generation, batch.filter_generation)
+        self.guard = guard or LaunchGuard(device, batch.states.generation, batch.filter_generation)
         self.resize(capacity or max(64, 4 * count))
         self._commands = Commands()
-        self._make_boxes(wp.launch)
+        self.boxes.make(wp.launch, self.guard, self.lower, self.upper)
         # Made here, since no graph can capture it.
         self.bvh = wp.Bvh(self.lower, self.upper, groups=self.group)
 
     def resize(self, capacity: int):
         """Make room for a number of pairs."""
-        for owner, name, array in self.make_room(wp.empty(capacity, dtype=wp.vec2i, device=self.device)):
+        for owner, name, array in self.make_arrays(capacity):
             setattr(owner, name, array)
 
-    def make_room(self, pairs: wp.array) -> list:
+    def make_arrays(self, capacity: int) -> list:
         """Return (owner, attribute, new array) of a list of pairs and of what sorts them."""
+        made = [(self, "pairs", wp.empty(capacity, dtype=wp.vec2i, device=self.device))]
         # The sort takes as much again as scratch.
-        names = {"key": wp.int64, "order": wp.int32} if self.sorts else {}
-        sorting = {name: wp.empty(2 * len(pairs), dtype=dtype, device=self.device) for name, dtype in names.items()}
-        return [(self, name, array) for name, array in {"pairs": pairs, **sorting}.items()]
+        for name, dtype in {"key": wp.int64, "order": wp.int32}.items() if self.sorts else ():
+            made.append((self, name, wp.empty(2 * capacity, dtype=dtype, device=self.device)))
+        return made
 
     def launch(self):
         """Box, rebuild, query, and sort if asked. Launches only, so that a graph can capture it."""
-        given = *self.guard.given(), self.pairs.ptr, self._options()
+        given = *self.guard.given(), self.pairs.ptr, self.boxes.given()
         launch_boxes, launch_find = self._commands.find_callables("pairs", given, self.device, self._make_launches)
         launch_boxes()
         self.bvh.rebuild()
@@ -90,10 +115,6 @@ class BroadPhase(DeviceMemory):
         launch_find()
         if self.sorts:
             self._sort()
-
-    def _options(self) -> tuple:
-        """Return the numbers that boxes depend on, by which launches are recorded anew."""
-        return (self.wide,)
 
     def _sort(self):
         room = len(self.pairs)
@@ -112,11 +133,7 @@ class BroadPhase(DeviceMemory):
             *(self.collision_bits, self.batch.objects.pool, self.pair_count, self.pairs),
         ]
         find = launch(find_pair_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
-        return [self._make_boxes(launch), find]
-
-    def _make_boxes(self, launch):
-        inputs = [self.batch.trees, self.guard.record(), self.wide, self._reach, self.lower, self.upper]
-        return launch(pose_box_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
+        return [self.boxes.make(launch, self.guard, self.lower, self.upper), find]
 
     def count_found(self) -> int:
         """Return how many pairs the last launch found. Waits for the device.
@@ -143,7 +160,7 @@ class BroadPhase(DeviceMemory):
         Args:
             within: Distance [world units] up to which objects count as a pair.
         """
-        self.wide = 0.5 * within
+        self.boxes.wide = 0.5 * within
         self.launch()
         found = self.count_found()
         if found > len(self.pairs):

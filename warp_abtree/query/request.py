@@ -11,8 +11,11 @@ from warp_abtree.kernels.intersect import face_pairs
 OUTPUTS = {"any": face_pairs.OUTPUT_ANY, "count": face_pairs.OUTPUT_COUNT, "faces": face_pairs.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.EXACT, "float32": predicates.FLOAT32}
 
-# What one output alone takes, beside distances that most do.
-OPTIONS = {"within", "tolerance", "relative", "beyond", "signed", "originals", "gap"}
+# Options that each output takes beside precision.
+_HITS, _DISTANCE = ("within",), ("tolerance", "relative", "beyond", "signed", "originals")
+SCENE_OPTIONS = {"any": _HITS, "count": _HITS, "faces": _HITS, "contacts": ("within", "gap"), "distance": _DISTANCE}
+SWEEP_OPTIONS = {"any": _HITS, "count": _HITS, "faces": (), "distance": _DISTANCE}
+SWEEP_OPTIONS["first_contact"] = "end_poses", "tolerance", "screw", "linear"
 
 # A launch of 32 threads a pair stays within 2^31.
 PAIRS_MAX = 2**26
@@ -78,19 +81,30 @@ def check_request(output: str, precision: str):
         raise ValueError(f"output {output!r} is found by ab.{others[output]}, or Scene.intersect")
 
 
-def given_options(caller: str, **options) -> dict:
-    """Return the options that are neither None nor False; raise TypeError for one that none of the outputs has."""
-    unknown = set(options) - OPTIONS
+def check_options(caller: str, taken: dict, output: str, precision: str, options: dict) -> dict:
+    """Return the options of an output that are neither None nor False.
+
+    Args:
+        taken: Options of each output that the caller has, such as `SCENE_OPTIONS`.
+
+    Raises:
+        TypeError: An option that none of the outputs has.
+        ValueError: An unknown output or precision, or an option that means nothing for this output.
+    """
+    unknown = set(options) - {name for names in taken.values() for name in names}
     if unknown:
         raise TypeError(f"{caller} has no option {sorted(unknown)[0]!r}")
-    return {name: value for name, value in options.items() if value is not None and value is not False}
-
-
-def refuse_options(output: str, given: dict):
-    """Raise ValueError for options, by name, that are given though they mean nothing for an output."""
-    for name, is_given in given.items():
-        if is_given is not False:
+    given = {name: value for name, value in options.items() if value is not None and value is not False}
+    if output not in taken:
+        check_request(output, precision)
+    if output in ("distance", "first_contact") and precision != "exact":
+        raise ValueError(f"precision means nothing for output {output!r}")
+    for name in given:
+        if name not in taken[output]:
             raise ValueError(f"{name} means nothing for output {output!r}")
+    if precision not in tuple(PRECISIONS):
+        check_request("faces", precision)
+    return given
 
 
 def check_gap(gap, pair_count, object_count: int) -> np.ndarray:

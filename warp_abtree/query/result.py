@@ -95,7 +95,7 @@ class Result(DeviceMemory):
         count: Intersecting face pairs of each, with a gap those nearer than that too, int64 (p,); None for "any".
         faces: (pair, face of the pair's first object, face of its second), int32 (k, 3), sorted; None unless output
             is "faces" or "contacts".
-        contacts, pair_contacts: Structured arrays (k,) and (p,), see `warp_abtree.query.contacts`; None unless
+        contacts, pair_contacts: Structured arrays (k,) and (p,), see `query.stages.contacts`; None unless
             output is "contacts".
         apart: Whether each pair is proved farther apart than `within`, bool (p,); None without within.
         points: Contact points of a `ManifoldQuery`: a dictionary of pair, place in `pairs`, int (k,); point and normal,
@@ -103,10 +103,10 @@ class Result(DeviceMemory):
             each object [world units], float64 (p, 2, 3). None from other queries.
         distance, bracket, point_faces: Least distance of each pair [world units], float64 (p,), proven lower and upper
             bound of it, (p, 2), and the faces that the nearest points lie on, int32 (p, 2), see
-            `warp_abtree.query.distance`; None unless output is "distance".
+            `query.stages.distance`; None unless output is "distance".
         time, clear, undecided: Time of first contact of each pair, float64 (p,) in [0, 1], never late and 1 where it is
             proved clear of contact, bool (p,); where undecided, bool (p,), contact may be as much later as there is
-            time. See `warp_abtree.scene.first_contact`; None from other queries.
+            time. See `query.stages.first_contact`; None from other queries.
         node_tests, triangle_tests, float64_tests, exact_tests: Work done for each pair, int64 (p,): pairs of boxes,
             pairs of faces, those of them that float32 left uncertain, and of these those that took exact arithmetic. On
             the CPU a pair may take fewer of them after others of the same first object.

@@ -1,10 +1,13 @@
 """Hits in the order of `Result.faces`, sorted on the host or on the device."""
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.io import sort_hits, sort_segments
+from warp_abtree.query.staging import first_rows
 
 # Rows whose sorting takes longer than packing each into one number, which sorts 20 times as fast.
 ROWS_TO_PACK = 1000
@@ -41,35 +44,6 @@ def sort_passes(pair_room: int, face_count: int, key_bits: int) -> list:
     return [(0, 0, face), (pair, face, 0)]
 
 
-def make_sort(hits, count: int, pair_room: int, passes: list, order, key, rows, ends, launch) -> list:
-    """Return what `launch` makes of the kernels that sort the first hits: one a pass, and the last.
-
-    Args:
-        hits: `Hits` whose face pairs are sorted; those that it lacks count as a pair of their own, the last.
-        order, key: Scratch, device int32 and int64 (2 count,); the keys of the last pass stay.
-        rows: Device vec3i (count,), for the hits in order.
-        ends: Device int32 (pair_room + 1,), for where those of each pair start, and int32 (1,), which becomes 0; or
-            (0,) twice.
-        launch: Takes what `wp.launch` does.
-    """
-    made = []
-    for number, widths in enumerate(passes):
-        inputs = [pair_room, wp.vec3i(*widths), number == 0, hits.total, hits.face, order, key]
-        made.append(launch(sort_hits.make_key_kernel, count, inputs, device=hits.face.device))
-    inputs = [count, sum(passes[-1][1:]), hits.total, hits.face, order, key, rows, *ends]
-    threads = max(count, len(ends[0]))
-    return [*made, launch(sort_hits.place_row_kernel, threads, inputs, device=hits.face.device)]
-
-
-def sort_on_device(launches: list, count: int, passes: list, order, key):
-    """Sort hits by the launches of `make_sort`, each a callable. Launches only."""
-    for launch, widths in zip(launches, passes):
-        launch()
-        with wp.ScopedDevice(key.device):
-            wp.utils.radix_sort_pairs(key, order, count, end_bit=sum(widths))
-    launches[-1]()
-
-
 def first_sort(device) -> list:
     """Return the kernel that sorts few hits, and its block size."""
     if device.is_cuda or current_regime().segments:
@@ -96,9 +70,11 @@ def make_segment_sort(hits, count: int, threads: int, key, rows, ends, launch) -
     """Return what `launch` makes of the kernels that sort the first hits by a segment a pair, with so many threads.
 
     Args:
-        hits, key, rows, launch: As for `make_sort`.
-        ends: Device int32 (pair_room + 1,), for where the hits of each pair start; int32 (1,), which becomes 0, and
+        hits: `Hits` whose face pairs are sorted.
+        key, rows: As for `HitSort.launch`.
+        ends: Device int32 (pair room + 1,), for where the hits of each pair start; int32 (1,), which becomes 0, and
             vec3i for `ChunkSums.span`, or (0,).
+        launch: Takes what `wp.launch` does.
     """
     start, deferred, span = ends
     device, block, room = key.device, sort_segments.SEGMENT_THREADS, len(start) - 1
@@ -113,3 +89,67 @@ def make_segment_sort(hits, count: int, threads: int, key, rows, ends, launch) -
     made.append(make(sort_segments.take_place_kernel, count, [count, hits.total, hits.face, start, key]))
     inputs = [threads // group, threads, start, key, rows, span]
     return [*made, make(sort_segments.sort_segment_kernel, blocks[1] * lanes, inputs)]
+
+
+class HitSort:
+    """Sort of an operator's hits on the device: by a segment a pair where pairs have few, else by radix.
+
+    Args:
+        operator: Whose hits are sorted; those that are missing count as a pair of their own, the last.
+    """
+
+    def __init__(self, operator: Any):
+        self.operator = operator
+        self._none = tuple(wp.empty(0, dtype=dtype, device=operator.device) for dtype in (wp.int32, wp.int32, wp.vec3i))
+
+    def launch(self, count: int, order, key, rows, staging=None, ends=None) -> bool:
+        """Write the first hits to rows in order; return whether by segments. Launches only.
+
+        Args:
+            order, key: Scratch, device int32 and int64 (2 count,); the keys of the last pass stay.
+            rows: Device vec3i (count,).
+            staging: Where there is room for the starts of pairs, if no ends are asked.
+            ends: What else is written: where the hits of each pair start, device int32 (pair room + 1,); zeros for
+                int32 (2,); and `ChunkSums.span`, vec3i, by segments alone.
+        """
+        if count == 0:
+            return False
+        operator = self.operator
+        chosen, room = operator.regime.segments, len(operator.pairs)
+        threads = segment_threads(count, room, chosen) if operator.device.is_cuda or chosen else 0
+        given: tuple = count, threads, order.ptr, key.ptr, rows.ptr
+        if threads:
+            if ends is None:
+                start = first_rows(staging.room("start", room + 1, wp.int32), room + 1)
+                ends, given = (start, *self._none[1:]), (*given, start.ptr)
+            for launch in operator.find_launches(
+                "segments",
+                lambda launch: make_segment_sort(operator.hits, count, threads, key, rows, ends, launch),
+                *given,
+            ):
+                launch()
+            return True
+        ends = self._none if ends is None else ends
+        passes = sort_passes(room, int(operator.batch.models.face_count.max()), operator.regime.key_bits)
+        *makers, placer = operator.find_launches(
+            "sort", lambda launch: self._make_radix(count, passes, order, key, rows, ends, launch), *given
+        )
+        for launch, widths in zip(makers, passes, strict=True):
+            launch()
+            with wp.ScopedDevice(operator.device):
+                wp.utils.radix_sort_pairs(key, order, count, end_bit=sum(widths))
+        placer()
+        return False
+
+    def _make_radix(self, count, passes, order, key, rows, ends, launch) -> list:
+        """Return what `launch` makes of the kernels that make the keys of each pass, and of the last, that places rows.
+
+        One call of Warp's sort lies behind each pass.
+        """
+        start, totals, _ = ends
+        hits, device, made = self.operator.hits, self.operator.device, []
+        for number, widths in enumerate(passes):
+            inputs = [len(self.operator.pairs), wp.vec3i(*widths), number == 0, hits.total, hits.face, order, key]
+            made.append(launch(sort_hits.make_key_kernel, count, inputs, device=device))
+        inputs = [count, sum(passes[-1][1:]), hits.total, hits.face, order, key, rows, start, totals]
+        return [*made, launch(sort_hits.place_row_kernel, max(count, len(start)), inputs, device=device)]

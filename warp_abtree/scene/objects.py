@@ -9,7 +9,7 @@ from warp_abtree.checks.arguments import flag, to_numpy, whole_number
 from warp_abtree.model.model import Model
 from warp_abtree.model.winding import check_solid
 from warp_abtree.query.broad_phase import EVERY_WORLD
-from warp_abtree.scene.poses import launch_place
+from warp_abtree.state.poses import launch_place
 
 ALL_BITS = 2**32 - 1
 

@@ -2,6 +2,7 @@
 
 import warnings
 from functools import partial
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -9,13 +10,14 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.kernels.io import pipeline as kernels
-from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.narrow_phase import Query
+from warp_abtree.query.operator import Operator
 from warp_abtree.query.request import CapacityError, check_capacity
 from warp_abtree.query.result import Result
-from warp_abtree.scene.poses import QUATERNION_TOLERANCE
+from warp_abtree.query.stages.contacts import ContactQuery
+from warp_abtree.query.stages.intersect import Query
 from warp_abtree.state.device_update import NO_FAULTS, DeviceLodUpdate, LevelStates
 from warp_abtree.state.generation import STALE_GRAPH
+from warp_abtree.state.poses import QUATERNION_TOLERANCE
 
 
 def check_groups(groups, object_model) -> np.ndarray:
@@ -120,8 +122,8 @@ class Pipeline(DeviceMemory):
         wp.launch(kernels.read_pose_kernel, len(self.poses), [batch.objects.pool, self.poses], device=self.device)
         self._bad_poses = wp.empty(2, dtype=wp.int32, device=self.device)
         self._demand = wp.zeros(4, dtype=wp.int64, device=self.device)
-        make = ContactQuery if output == "contacts" else partial(Query, output=output)
-        self.query: Query = make(batch, **request)
+        make: Any = ContactQuery if output == "contacts" else partial(Query, output=output)
+        self.query: Operator = make(batch, **request)
         # Loads the kernels, and tells what the poses as they stand take.
         self.launch()
         self._fit_uncertain(request.get("capacity"))

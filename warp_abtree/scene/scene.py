@@ -7,15 +7,14 @@ from warp_abtree.checks.arguments import check_device, flag, to_numpy, whole_num
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.model.model import Model
 from warp_abtree.query.broad_phase import BroadPhase
-from warp_abtree.query.request import given_options, refuse_options
 from warp_abtree.query.result import Result, contact_dtypes
 from warp_abtree.scene.kept_queries import KeptQueries
 from warp_abtree.scene.objects import ALL_BITS, ObjectList, check_columns, check_lods, check_models
-from warp_abtree.scene.poses import HostPoses, check_poses, device_rows, place_rows
 from warp_abtree.scene.tree_state import TreeState, read_tree_state
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.batch import Batch, check_pairs, exclusion_keys
 from warp_abtree.state.lod_update import LodUpdate
+from warp_abtree.state.poses import HostPoses, check_poses, device_rows, place_rows
 
 
 class Scene(DeviceMemory):
@@ -297,8 +296,8 @@ class Scene(DeviceMemory):
                 filtered out of the broad phase; None asks the broad phase for the pairs whose boxes overlap, or are no
                 farther apart than within, gap or beyond if that is one distance.
             output: "any", "count", "faces" or "contacts": each answers those before it too; what a contact is, and
-                an object pair's summary of them, stands in `warp_abtree.query.contacts`. Or "distance": how far apart
-                the surfaces are, and where they are nearest, see `warp_abtree.query.distance`.
+                an object pair's summary of them, stands in `query.stages.contacts`. Or "distance": how far apart
+                the surfaces are, and where they are nearest, see `query.stages.distance`.
             precision: "exact": the answer is exact for A's vertices and the posed ones of B, A the object with the
                 smaller index. "float32" takes the signs of rounded determinants.
             within: Distance d >= 0 [world units], or (p,) of them: `result.apart` tells the pairs whose posed surfaces,
@@ -309,7 +308,7 @@ class Scene(DeviceMemory):
             options: What one output alone takes, None as if not given. Of "distance": tolerance, relative and beyond,
                 when the search ends, and signed, whether depths of solids are negative distances, see `DistanceQuery`;
                 originals, whether it is that of the original meshes, whatever the LODs, see
-                `warp_abtree.query.distance`. Of "contacts": gap, a distance [world units] or (p,) of them: faces nearer
+                `query.stages.distance`. Of "contacts": gap, a distance [world units] or (p,) of them: faces nearer
                 than that have contacts too, and all have a separation.
 
         Raises:
@@ -320,11 +319,7 @@ class Scene(DeviceMemory):
         check_device(self.device, "Scene.intersect (Query.launch can)")
         contact_dtypes(contact_dtype)
         flag(device, "device")
-        options = given_options("intersect", within=within, **options)
-        if output == "distance":
-            refuse_options(output, {"precision": precision != "exact"})
-            return self._queries.find_distances(pairs, options, device)
-        return self._queries.find_hits(pairs, output, precision, contact_dtype, options, device)
+        return self._queries.find(pairs, output, precision, contact_dtype, {"within": within, **options}, device)
 
     def first_contact(
         self, pairs, end_poses, tolerance=1e-6, screw=False, linear=False, device: bool = False
@@ -343,7 +338,7 @@ class Scene(DeviceMemory):
             device: As for `intersect`.
 
         Returns:
-            `Result` with time, clear and undecided; what they are stands in `warp_abtree.scene.first_contact`.
+            `Result` with time, clear and undecided; what they are stands in `query.stages.first_contact`.
 
         Raises:
             ValueError: Bad pairs, poses or tolerance, a scene without objects; an object of a pair that turns by half a

@@ -15,15 +15,16 @@ from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.base.arrays import NONE_REFUSED
 from warp_abtree.kernels.io.sweep import pose_placer, report_chunk_kernel
-from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond, check_flags
-from warp_abtree.query.narrow_phase import Query
-from warp_abtree.query.request import refuse_signed
-from warp_abtree.scene.first_contact import FirstContactQuery, check_asked_contacts
-from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
+from warp_abtree.query.operator import Operator
+from warp_abtree.query.request import SWEEP_OPTIONS, check_options, check_within, refuse_signed
+from warp_abtree.query.stages.distance import DistanceQuery, check_beyond, check_distance_options
+from warp_abtree.query.stages.first_contact import FirstContactQuery
+from warp_abtree.query.stages.intersect import Query
 from warp_abtree.scene.scene import Scene
-from warp_abtree.scene.sweep_poses import DeviceRows, refuse_row, take_ends, take_rows
+from warp_abtree.scene.sweep_poses import DeviceRows, PoseSlot, find_copy_stream, refuse_row, take_ends, take_rows
 from warp_abtree.state.arrays import ObjectArrays
 from warp_abtree.state.batch import Batch
+from warp_abtree.state.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
 
 # Poses of a launch: enough to fill a GPU, few enough that millions need no more memory; fewer where few are given.
 CHUNKS = (1024, 8192, 65536)
@@ -84,32 +85,6 @@ class _Chunk:
             self.chunk_query = None
 
 
-@functools.cache
-def _find_copy_stream(alias):
-    """Return a device's stream for transfers, one for all: Warp makes and ends streams on one thread at a time."""
-    return wp.Stream(alias)
-
-
-class _Slot:
-    """Buffers through which a chunk passes: poses in, answers out. On the CPU host and device share them."""
-
-    def __init__(self, device, room, output, scalar, width):
-        def mirror(array):
-            return array if device.is_cpu else wp.empty(len(array), dtype=array.dtype, device="cpu", pinned=True)
-
-        self.width = width
-        self.poses = wp.empty((room, width), dtype=scalar, device=device)
-        self.answer = wp.empty(room if output == "any" else 0, dtype=wp.uint8, device=device)
-        self.report = wp.empty(2, dtype=wp.int32, device=device)
-        self.poses_flat = self.poses.flatten()
-        self.poses_host, self.report_host = mirror(self.poses_flat), mirror(self.report)
-        answer = wp.empty(room, dtype=wp.int64, device=device) if output == "count" else self.answer
-        self.answer_host = mirror(answer)
-        self.uncertain_room = 0
-        if device.is_cuda:
-            self.loaded, self.done = wp.Event(device), wp.Event(device)
-
-
 class _ChunkQuery:
     """One kind of query about a pair of models, and its buffer slots."""
 
@@ -120,7 +95,7 @@ class _ChunkQuery:
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
         if self.output == "distance":
-            self.query: Query = DistanceQuery(chunk.batch, self.pairs, signed=signed)
+            self.query: Operator = DistanceQuery(chunk.batch, self.pairs, signed=signed)
         elif self.output == "first_contact":
             self.query = FirstContactQuery(chunk.batch, None, self.pairs, linear=precision == "linear")
         else:
@@ -128,14 +103,14 @@ class _ChunkQuery:
             self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision, within=within)
         self.count = self.room
         self._slots: dict = {}
-        self.copies = _find_copy_stream(self.device.alias) if self.device.is_cuda else None
+        self.copies = find_copy_stream(self.device.alias) if self.device.is_cuda else None
 
     def _find_slots(self, poses):
         """Return the slots of poses of one type, made at the first use."""
         kind = poses.scalar, poses.width
         if kind not in self._slots:
             count = 1 + (self.output in PACKED_DTYPES)
-            made = [_Slot(self.device, self.room, self.output, *kind) for _ in range(count)]
+            made = [PoseSlot(self.device, self.room, self.output, *kind) for _ in range(count)]
             if self.device.is_cuda:
                 # Another stream may touch what was allocated on this one only once it is there.
                 wp.synchronize_device(self.device)
@@ -195,7 +170,7 @@ class _ChunkQuery:
 
     def _run_grown(self, slot, count):
         """Query the poses in a slot, with buffers that grow as needed. Waits for the device."""
-        self.query.set_pairs(self.pairs[:count])
+        self.query.ask_pairs(self.pairs[:count])
         self.count = count
         self._place(slot)
         return self.query.run()
@@ -237,8 +212,8 @@ class _ChunkQuery:
                 refuse_row(poses, start + refused)
             yield slice(start, start + count), result
 
-    def _run(self, pairs, within=None):
-        self.query.set_pairs(pairs, within)
+    def _run(self, pairs, **distances):
+        self.query.ask_pairs(pairs, **distances)
         return self.query.run()
 
     def find_faces(self, poses):
@@ -260,7 +235,7 @@ class _ChunkQuery:
         """Return the rows of "distance" of all poses."""
         assert isinstance(self.query, DistanceQuery)
         self.query.set_tolerance(**tolerances)
-        run = functools.partial(self._run, within=beyond)
+        run = functools.partial(self._run, beyond=beyond)
         found = np.empty(len(poses), DISTANCE_ROWS)
         for part, result in self._ask(poses, run):
             rows = found[part]
@@ -341,15 +316,15 @@ def sweep(
         For "any" bool (p,), for "count" the intersecting face pairs of each pose, int64 (p,), for "faces" rows (pose,
         face of A, face of B), int32 (k, 3), sorted; with within, a structured array (p,) of any or count, and apart,
         whether the surfaces are proved farther apart. For "distance" a structured array (p,) of distance, bracket (2,),
-        points (2, 3) [A's frame] and faces (2,), see `warp_abtree.query.distance`. For "first_contact" one of time,
-        clear and undecided, see `warp_abtree.scene.first_contact`.
+        points (2, 3) [A's frame] and faces (2,), see `query.stages.distance`. For "first_contact" one of time,
+        clear and undecided, see `query.stages.first_contact`.
 
     Raises:
         TypeError: model_a or model_b is no Model; an option has another name.
         ValueError: Bad poses, the first named, a LOD out of range, an unknown option or device, signed without a solid.
         RuntimeError: A graph is being captured.
     """
-    (check_asked_contacts if output == "first_contact" else check_asked)(output, precision, options)
+    options = _check_request(output, precision, options)
     pair = Scene(device)
     check_device(pair.device, "ab.sweep")
     with device_lock(pair.device):
@@ -363,6 +338,21 @@ def sweep(
         if options.get("originals"):
             pair.set_lods([model.lod_max for model in (model_a, model_b)])
         return _sweep(pair, poses, (output, precision), options)
+
+
+def _check_request(output, precision, options) -> dict:
+    """Return the options that are given, checked but for the poses."""
+    given = check_options("sweep", SWEEP_OPTIONS, output, precision, options)
+    if output == "first_contact":
+        if "end_poses" not in given:
+            raise TypeError(f"sweep needs end_poses for output {output!r}")
+        FirstContactQuery.plan(**{name: value for name, value in given.items() if name != "end_poses"})
+        return given
+    check_distance_options(given)
+    check_beyond(given.get("beyond"))
+    if "within" in given:
+        check_within(given["within"], known="a sweep: one distance for all")
+    return given
 
 
 def _sweep(pair, poses, asked, options):
@@ -381,9 +371,9 @@ def _sweep(pair, poses, asked, options):
         owners = [weakref.ref(model, lambda _: _kept.pop(key, None)) for model in models]
         posed = _PosedModels(pair, owners)
     chunk = posed.find_chunk(len(poses))
-    query = chunk.find_query(output, precision, check_flags(options)[0], within is not None)
+    query = chunk.find_query(output, precision, options.get("signed", False), within is not None)
     if output == "distance":
-        tolerances = {name: value for name, value in options.items() if name in ("tolerance", "relative")}
+        tolerances = {name: options[name] for name in ("tolerance", "relative") if name in options}
         answers = query.find_distances(poses, tolerances, check_beyond(options.get("beyond")))
     elif output == "first_contact":
         answers = query.find_first_contacts(poses, options.pop("end_poses"), options)

@@ -1,10 +1,12 @@
 """Poses of a sweep, where they lie: in the memory of the host, or of the device that asks."""
 
+import functools
+
 import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import to_numpy
-from warp_abtree.scene.poses import check_poses, device_rows
+from warp_abtree.state.poses import check_poses, device_rows
 
 SCALARS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
 
@@ -74,3 +76,29 @@ def take_ends(ends, count: int, device):
     if len(rows) != count:
         raise ValueError(f"end_poses: {len(rows)} given for {count} poses")
     return rows
+
+
+@functools.cache
+def find_copy_stream(alias):
+    """Return a device's stream for transfers, one for all: Warp makes and ends streams on one thread at a time."""
+    return wp.Stream(alias)
+
+
+class PoseSlot:
+    """Buffers through which a chunk passes: poses in, answers out. On the CPU host and device share them."""
+
+    def __init__(self, device, room, output, scalar, width):
+        def mirror(array):
+            return array if device.is_cpu else wp.empty(len(array), dtype=array.dtype, device="cpu", pinned=True)
+
+        self.width = width
+        self.poses = wp.empty((room, width), dtype=scalar, device=device)
+        self.answer = wp.empty(room if output == "any" else 0, dtype=wp.uint8, device=device)
+        self.report = wp.empty(2, dtype=wp.int32, device=device)
+        self.poses_flat = self.poses.flatten()
+        self.poses_host, self.report_host = mirror(self.poses_flat), mirror(self.report)
+        answer = wp.empty(room, dtype=wp.int64, device=device) if output == "count" else self.answer
+        self.answer_host = mirror(answer)
+        self.uncertain_room = 0
+        if device.is_cuda:
+            self.loaded, self.done = wp.Event(device), wp.Event(device)

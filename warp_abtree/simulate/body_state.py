@@ -8,11 +8,12 @@ import warp as wp
 from warp_abtree.checks.arguments import broadcast_rows, finite_array, first_line
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.quaternions import quaternions_of
+from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.bodies import bodies as kernels
 from warp_abtree.model.model import Model
-from warp_abtree.scene.poses import check_poses, launch_place
 from warp_abtree.scene.scene import Scene
+from warp_abtree.state.poses import check_poses, launch_place
 
 FIRST_STEP = 1 / 60
 """Length of a step [s] before the first one is known."""
@@ -31,32 +32,15 @@ def object_mask(chosen, count):
     return mask
 
 
-def zeros_of(struct, rows, columns, device):
-    """Return a struct of device arrays that are 0: `rows` entries each, or rows and columns."""
-    made = struct()
-    for name, variable in struct.vars.items():
-        shape = rows if variable.type.ndim == 1 else (rows, columns)
-        setattr(made, name, wp.zeros(shape, dtype=variable.type.dtype, device=device))
-    return made
-
-
 @dataclass(frozen=True)
 class MassProperties:
-    """Mass properties of a model at density 1, in the model's frame.
+    """Mass properties of a model at density 1, in the model's frame."""
 
-    Attributes:
-        volume: Volume [units^3].
-        centre: Centre of mass [units], float64 (3,).
-        moments: Principal moments of inertia about the centre, ascending, float64 (3,).
-        axes: Principal axes, a rotation matrix with unit columns, float64 (3, 3).
-        bounding_radius: Largest distance of a vertex from the centre [units].
-    """
-
-    volume: float
-    centre: np.ndarray
-    moments: np.ndarray
-    axes: np.ndarray
-    bounding_radius: float
+    volume: float  # [units^3]
+    centre: np.ndarray  # of mass [units], float64 (3,)
+    moments: np.ndarray  # principal moments of inertia about the centre, ascending, float64 (3,)
+    axes: np.ndarray  # principal axes, a rotation matrix with unit columns, float64 (3, 3)
+    bounding_radius: float  # largest distance of a vertex from the centre [units]
 
 
 IMMOVABLE = MassProperties(np.inf, np.zeros(3), np.full(3, np.inf), np.eye(3), np.inf)
@@ -66,16 +50,12 @@ IMMOVABLE = MassProperties(np.inf, np.zeros(3), np.full(3, np.inf), np.eye(3), n
 def mass_properties(model: Model) -> MassProperties:
     """Return the mass properties of a model's original mesh, the same at every LOD.
 
-    A mesh that is not closed, not consistently wound, or without positive volume has those of its convex hull.
-
-    Raises:
-        ValueError: The mesh is flat, or its convex hull is needed and scipy or networkx is missing.
+    A mesh that is not closed, not consistently wound, or without positive volume has those of its convex hull. Raises
+    ValueError for a flat one, or where the hull is needed and scipy or networkx is missing.
     """
     import trimesh
 
-    model.warn_of_winding(
-        "the mass of its bodies and the normals of their contacts depend on the winding", stacklevel=5
-    )
+    model.warn_of_winding("the mass of its bodies and the normals of their contacts depend on the winding")
     vertices, faces, _ = model.mesh_at(model.lod_max)
     middle = 0.5 * (vertices.min(0) + vertices.max(0))
     size = np.ptp(vertices, axis=0).max()
@@ -116,14 +96,6 @@ def _ranks(worlds):
     return ranks
 
 
-def _finite_rows(values, what, count):
-    """Return a vector for each of `count` objects, float64 (count, 3)."""
-    values = broadcast_rows(values, what, (count, 3))
-    if not np.isfinite(values).all():
-        raise ValueError(f"{what}: a number is not finite")
-    return values
-
-
 class RigidBodies(DeviceMemory):
     """State of the bodies of a scene; `Dynamics` documents the arguments.
 
@@ -140,8 +112,8 @@ class RigidBodies(DeviceMemory):
         self.gravity = finite_array(gravity, "gravity", (3,))
         self.kinematic = object_mask(kinematic, n)
         self.rigid = ~self.kinematic & (pool.is_static.numpy() == 0)
-        velocity = _finite_rows(velocity, "velocity", n)
-        angular_velocity = _finite_rows(angular_velocity, "angular_velocity", n)
+        velocity = broadcast_rows(velocity, "velocity", (n, 3))
+        angular_velocity = broadcast_rows(angular_velocity, "angular_velocity", (n, 3))
         models = sorted({scene.object_model[i] for i in np.flatnonzero(self.rigid)})
         found = {m: mass_properties(scene.models[m]) for m in models}
         own = [found[m] if r else IMMOVABLE for m, r in zip(scene.object_model, self.rigid)]

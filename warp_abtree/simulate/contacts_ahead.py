@@ -1,72 +1,52 @@
-"""Contact points of rigid bodies, those included that they come to within a step: `AheadQuery`."""
+"""Gaps of rigid bodies, within which their contacts are looked for: as far as they move in a step."""
 
 import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.bodies import ahead
-from warp_abtree.query.distance import DistanceQuery
-from warp_abtree.query.manifold import ManifoldQuery
+from warp_abtree.query.operator import Operator
+from warp_abtree.query.stage import Array, Rooms, fields
+from warp_abtree.query.stages.distance import NOT_BEYOND, DistanceStage
+from warp_abtree.query.stages.intersect import GapStage, IntersectStage
 
 
-class NearestQuery(DistanceQuery):
-    """Distances, of surfaces alone, of those pairs of another query whose gap is wide."""
-
-    def __init__(self, scene):
-        self._chosen = ahead.Chosen()
-        super().__init__(scene, np.zeros((0, 2), np.int32))
-
-    def _pair_arrays(self, room: int) -> list:
-        place = wp.empty(room, dtype=wp.int32, device=self.device)
-        return [*super()._pair_arrays(room), (self._chosen, "place", place)]
-
-    def make_room(self, room: int):
-        """Make room for so many pairs."""
-        if len(self.pairs) < room:
-            self._take_pairs(wp.empty(room, dtype=wp.vec2i, device=self.device))
-            chosen = self._chosen
-            chosen.count, chosen.pairs, chosen.beyond = self.pair_count, self.pairs, self._found.beyond
-
-    def cut(self, query, gap, bodies):
-        """Cut the gaps of a query's pairs, which there is room for; see `kernels.bodies.ahead`. Launches only."""
-        room, trees, chosen = len(query.pairs), self.batch.trees, self._chosen
-        given = query.guard.given()
-        with self.guard.launching(self):
-            self.pair_count.zero_()
-            inputs = [trees, query.pair_batch, gap, bodies, chosen]
-            self._repeat(given, ahead.choose_fast_kernel, room, inputs)
-            self.traverse()
-            self._repeat(given, ahead.cut_gap_kernel, room, [trees, chosen, self.distances, bodies, gap])
-
-    def _find_contained(self):
-        pass
-
-    def _make_crossings(self, launch) -> list:
-        return []
-
-    def _make_inside(self, launch) -> list:
-        return []
-
-
-class AheadQuery(ManifoldQuery):
-    """Contact points of bodies where they stand, and where they first meet as far ahead as they move in a step.
-
-    As `ManifoldQuery` with a gap otherwise.
+class AheadGapStage(GapStage):
+    """Gaps as wide as bodies move in a step, cut to a little over the distance of a pair where that is less.
 
     Args:
-        scene, capacity: As for `ManifoldQuery`.
+        scene: `Scene` of the bodies.
         bodies: `kernels.bodies.bodies.Bodies` of all objects; its `reach` is the widest gap.
     """
 
-    def __init__(self, scene, bodies, capacity=None):
-        self._bodies, self._nearest = bodies, NearestQuery(scene)
-        super().__init__(scene, None, capacity, gap=bodies.reach)
+    def __init__(self, scene, bodies):
+        super().__init__(bodies.reach)
+        self._bodies, self._chosen = bodies, ahead.Chosen()
+        # Of surfaces alone, of those pairs whose gap is wide.
+        self._distance = DistanceStage(NOT_BEYOND, with_points=False)
+        self._nearest = Operator(scene, [IntersectStage(), self._distance], np.zeros((0, 2), np.int32))
 
-    def _take_pairs(self, pairs):
-        self._nearest.make_room(len(pairs))
-        super()._take_pairs(pairs)
+    def prepare(self, rooms: Rooms):
+        """Make room for the distances of as many pairs."""
+        nearest, chosen = self._nearest, self._chosen
+        if rooms.pairs > nearest.rooms.pairs:
+            nearest.make_room(pairs=rooms.pairs)
+        chosen.count, chosen.pairs = nearest.pair_count, nearest.pairs
+        chosen.beyond = self._distance.found.beyond
 
-    def prove_apart(self):
-        """Cut gaps to a little over the distances of the pairs. Launches only."""
-        super().prove_apart()
-        if len(self.pairs):
-            self._nearest.cut(self, self.hits.gap, self._bodies)
+    def arrays(self, rooms: Rooms) -> list[Array]:
+        """Return the gaps, and the places of chosen pairs."""
+        return [*super().arrays(rooms), *fields(self._chosen, rooms.pairs, place=wp.int32)]
+
+    def search(self):
+        """Find gaps, and cut those that are wide; see `kernels.bodies.ahead`. Launches only."""
+        super().search()
+        nearest, chosen, bodies, operator = self._nearest, self._chosen, self._bodies, self.operator
+        trees, gap, room, given = operator.batch.trees, operator.hits.gap, len(operator.pairs), operator.guard.given()
+        nearest.check_whole()
+        with nearest.guard.launching(self):
+            nearest.pair_count.zero_()
+            inputs = [trees, operator.pair_batch, gap, bodies, chosen]
+            nearest.launch_kernel(ahead.choose_fast_kernel, room, inputs, given=given)
+            nearest.search()
+            inputs = [trees, chosen, self._distance.distances, bodies, gap]
+            nearest.launch_kernel(ahead.cut_gap_kernel, room, inputs, given=given)

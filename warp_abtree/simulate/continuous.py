@@ -4,8 +4,11 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.bodies import continuous as kernels
+from warp_abtree.query.operator import Operator
 from warp_abtree.query.request import Buffers
-from warp_abtree.scene.first_contact import FirstContactQuery
+from warp_abtree.query.stage import Array, Rooms
+from warp_abtree.query.stages.first_contact import FirstContactStage
+from warp_abtree.query.stages.intersect import InsideStage, IntersectStage
 from warp_abtree.scene.scene import Scene
 
 TIME_TOLERANCE = 2.0**-24  # of times, as a fraction of a step's motion
@@ -15,15 +18,81 @@ ROUND_MODES = kernels.CUT, kernels.MATCH, kernels.HOLD_BOTH, kernels.CERTIFY
 ROUNDS = [int(mode) for mode, times in zip(ROUND_MODES, (5, 4, 3, 1)) for _ in range(times)]
 
 
-class CertifiedMotions(FirstContactQuery):
-    """Fractions of the objects' motions towards their goals for which no two surfaces meet that were apart.
-
-    Pairs whose surfaces intersect at first do not count, nor do those without a rigid body.
+class MotionRounds(FirstContactStage):
+    """Cut the motions of objects in rounds, from goals on, until no pair that was apart meets.
 
     Args:
-        scene: `Scene` whose poses are where motions start, and where `end` puts them.
-        bodies: `kernels.bodies.bodies.Bodies` of all objects.
-        capacity: `Buffers`: object pairs that there is room for at first.
+        bodies: As for `CertifiedMotions`.
+
+    Attributes:
+        goals: As of `CertifiedMotions`.
+        state: `kernels.StepMotions`.
+        is_begun: Whether `begin` was launched since the last rounds.
+    """
+
+    def __init__(self, bodies):
+        super().__init__(TIME_TOLERANCE)
+        self._bodies, self.goals, self.state, self.is_begun = bodies, ObjectPool(), kernels.StepMotions(), False
+
+    def attach(self, operator: Operator):
+        """Take the operator."""
+        super().attach(operator)
+        self._pool, n, state = operator.batch.objects.pool, operator.batch.object_count, self.state
+        self.goals.rotation, self.goals.position = wp.clone(self._pool.rotation), wp.clone(self._pool.position)
+        state.goals, state.ends = self.goals, self.ends
+        for name, dtype in (("fraction", wp.float64), ("cut", wp.float64), *INTEGERS):
+            setattr(state, name, wp.zeros(n, dtype=dtype, device=operator.device))
+        state.counter = wp.zeros(3, dtype=wp.int32, device=operator.device)
+
+    def arrays(self, rooms: Rooms) -> list[Array]:
+        """Return what has an entry a pair or a thread."""
+        own = [Array(self.state, name, wp.int32, rooms.pairs, 0) for name in ("level", "is_again")]
+        return [*super().arrays(rooms), *own]
+
+    def launch(self, kernel, dim, inputs):
+        """Launch a kernel about the motions of a step."""
+        wp.launch(kernel, dim, inputs, device=self.operator.device)
+
+    def begin(self):
+        """Aim all motions at their goals, whole. Launches only."""
+        inputs = [self._pool, self._bodies, self.state]
+        self.launch(kernels.begin_way_kernel, len(self.state.fraction), inputs)
+        self.is_begun = True
+
+    def search(self):
+        """Cut the motions. Launches only."""
+        operator, bodies, state = self.operator, self._bodies, self.state
+        room, n, found, hits = len(operator.pairs), len(state.fraction), operator.pair_batch, operator.hits
+        if not self.is_begun:  # a search again, with more room
+            self.begin()
+        self.is_begun = False
+        self.launch(kernels.exempt_pair_kernel, room, [found, hits, bodies, state])
+        for mode in ROUNDS:
+            self.launch(kernels.choose_pair_kernel, room, [found, state, hits])
+            self.begin_motions()
+            if mode <= kernels.MATCH:
+                inputs = [found, self.contacts, bodies, state, self.motion]
+                self.launch(kernels.widen_motion_kernel, room, inputs)
+            self.follow_motions()
+            inputs = [mode, found, self._pool, hits, self.contacts, bodies, state]
+            self.launch(kernels.cut_way_kernel, room, inputs)
+            self.launch(kernels.apply_cut_kernel, n, [self._pool, bodies, state])
+            if self._is_settled():
+                break
+
+    def _is_settled(self) -> bool:
+        """Return whether further rounds would find nothing, where that can be told without a wait."""
+        device = self.operator.device
+        if not device.is_cpu or device.is_capturing:
+            return False
+        return not (self.state.is_changed.numpy().any() or self.state.is_again.numpy().any())
+
+
+class CertifiedMotions(Operator):
+    """Fractions of the objects' motions towards their goals for which no two surfaces meet that were apart.
+
+    Motions start at the poses of the scene, where `end` puts objects, too. Pairs whose surfaces intersect at first do
+    not count, nor do those without a rigid body.
 
     Attributes:
         goals: Poses that a step aims for, device arrays rotation and position of `kernels.base.arrays.ObjectPool`.
@@ -31,82 +100,36 @@ class CertifiedMotions(FirstContactQuery):
     """
 
     def __init__(self, scene: Scene, bodies, capacity: Buffers):
-        self._pool, n = scene.batch().objects.pool, scene.object_count
-        self._bodies, self.goals = bodies, ObjectPool()
-        self.goals.rotation, self.goals.position = wp.clone(self._pool.rotation), wp.clone(self._pool.position)
-        self._state, self._is_begun = kernels.StepMotions(), False
-        super().__init__(scene, None, None, capacity, TIME_TOLERANCE)
-        state, shared = self._state, self.broad_phase.shared_group
-        state.goals, state.ends = self.goals, self.ends
-        for name, dtype in (("fraction", wp.float64), ("cut", wp.float64), *INTEGERS):
-            setattr(state, name, wp.zeros(n, dtype=dtype, device=self.device))
-        state.counter = wp.zeros(3, dtype=wp.int32, device=self.device)
+        self._rounds, self._bodies = MotionRounds(bodies), bodies
+        super().__init__(scene, [IntersectStage(), InsideStage(), self._rounds], None, capacity, sort_pairs=True)
+        self._pool, self.goals = self.batch.objects.pool, self._rounds.goals
+        self._state, shared = self._rounds.state, self.broad_phase.shared_group
         # What moves in every world holds all of them together.
         world = self.broad_phase.group
         moves = bodies.motion_type.numpy() != int(kernels.STATIC)
-        state.world = wp.zeros_like(world) if (moves & (world.numpy() == shared)).any() else world
-        self.fraction = state.fraction
+        self._state.world = wp.zeros_like(world) if (moves & (world.numpy() == shared)).any() else world
+        self.fraction = self._state.fraction
 
-    def _pair_arrays(self, room: int) -> list:
-        made = super()._pair_arrays(room)
-        names = "level", "is_again"
-        return [*made, *((self._state, name, wp.zeros(room, dtype=wp.int32, device=self.device)) for name in names)]
-
-    def _launch(self, between=None):
-        self._begin()
-        self._is_begun = True
-        super()._launch(between)
-
-    def _run(self, kernel, dim, inputs):
-        wp.launch(kernel, dim, inputs, device=self.device)
-
-    def _begin(self):
-        self._run(kernels.begin_way_kernel, len(self.fraction), [self._pool, self._bodies, self._state])
-
-    def traverse(self):
-        """Cut the motions of objects in rounds, from goals on. Launches only."""
-        room, n, state = len(self.pairs), len(self.fraction), self._state
-        if not self._is_begun:  # a traversal again, with more room
-            self._begin()
-        self._is_begun = False
-        super(FirstContactQuery, self).traverse()
-        found = self.pair_batch
-        self._run(kernels.exempt_pair_kernel, room, [found, self.hits, self._bodies, state])
-        for mode in ROUNDS:
-            self._run(kernels.choose_pair_kernel, room, [found, state, self.hits])
-            self.begin_motions()
-            if mode <= kernels.MATCH:
-                inputs = [found, self.contacts, self._bodies, state, self._motion]
-                self._run(kernels.widen_motion_kernel, room, inputs)
-            self.follow_motions()
-            inputs = [mode, found, self._pool, self.hits, self.contacts, self._bodies, state]
-            self._run(kernels.cut_way_kernel, room, inputs)
-            self._run(kernels.apply_cut_kernel, n, [self._pool, self._bodies, state])
-            if self._is_settled():
-                break
-
-    def _is_settled(self) -> bool:
-        """Return whether further rounds would find nothing, where that can be told without a wait."""
-        if not self.device.is_cpu or self.device.is_capturing:
-            return False
-        return not (self._state.is_changed.numpy().any() or self._state.is_again.numpy().any())
+    def launch_search(self, between=None):
+        """Aim motions at their goals, and launch broad phase, exact test and rounds."""
+        self._rounds.begin()
+        super().launch_search(between)
 
     def free_stuck(self, dt: float):
         """Set other goals for bodies that were stuck in the last step. Launches only."""
-        self._run(kernels.free_stuck_kernel, len(self.fraction), [dt, self._pool, self._bodies, self._state])
+        self._rounds.launch(kernels.free_stuck_kernel, len(self.fraction), [dt, self._pool, self._bodies, self._state])
 
     def end(self, velocity_change):
         """Pose objects where their motions end, unless there was no room for all pairs. Launches only.
 
-        Args:
-            velocity_change: What gravity changes velocities by in a step [world units/s].
+        `velocity_change` is what gravity changes velocities by in a step [world units/s].
         """
         inputs = [wp.vec3d(*velocity_change), self.pair_batch, self.hits, self._state]
-        self._run(kernels.end_way_kernel, len(self.fraction), [*inputs, self._bodies, self._pool])
+        self._rounds.launch(kernels.end_way_kernel, len(self.fraction), [*inputs, self._bodies, self._pool])
 
     def is_whole(self) -> bool:
         """Return whether there was room for all pairs. Waits for the device."""
-        totals, lists = self._read_totals(), len(self.hits.uncertain)
+        totals, lists = self.readout.read_totals(), len(self.hits.uncertain)
         return totals.pairs <= len(self.pairs) and (not lists or totals.uncertain <= lists)
 
     def pair_totals(self) -> dict:
@@ -119,12 +142,8 @@ class CertifiedMotions(FirstContactQuery):
         return {"touching": touching, "undecided": undecided, "held": held}
 
     def check(self):
-        """Raise if there was no room for all pairs of the last step: then nothing moved. Waits for the device.
+        """Raise CapacityError if there was no room for all pairs of the last step: then nothing moved. Waits.
 
         Pairs that are undecided are no error, since their bodies wait where they are proved apart: see `pair_totals`.
-
-        Raises:
-            CapacityError: More pairs than there was room for.
-            RuntimeError: There was no step.
         """
         self.result().check()

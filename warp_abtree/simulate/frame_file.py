@@ -22,11 +22,7 @@ class FrameFile:
         self._written, self._end = 0, 0  # rows, and bytes without the tail
 
     def append(self, history: list[FrameRow]):
-        """Write the rows of a history that are not in the file yet.
-
-        Raises:
-            OSError: They cannot be written; the file holds those before.
-        """
+        """Write the rows that are not in the file yet; where that raises OSError, the file holds those before."""
         rows = [row.as_dict() for row in history[self._written :]]
         if not rows:
             return

@@ -7,7 +7,7 @@ import numpy as np
 
 from warp_abtree.checks.arguments import broadcast_rows
 from warp_abtree.checks.quaternions import multiply_quaternions, quaternions_about
-from warp_abtree.scene.poses import check_poses
+from warp_abtree.state.poses import check_poses
 
 
 def triangle_wave(phase) -> np.ndarray:
@@ -54,13 +54,11 @@ class Kinematic:
         if self.position.ndim != 2 or self.position.shape[1] != 3:
             raise ValueError(f"position: shape {self.position.shape}, not (n, 3)")
         n = len(self.position)
-        for name, width in (("rotation", 4), ("velocity", 3), ("axis", 3), ("shuttle", 3)):
-            setattr(self, name, broadcast_rows(getattr(self, name), name, (n, width)))
-        for name in ("rate", "period", "phase"):
-            setattr(self, name, broadcast_rows(getattr(self, name), name, (n,)))
-        for name in ("position", "rotation", "velocity", "axis", "rate", "shuttle", "phase"):
-            if not np.isfinite(getattr(self, name)).all():
-                raise ValueError(f"{name}: a number is not finite")
+        shapes = dict(
+            position=(n, 3), rotation=(n, 4), velocity=(n, 3), axis=(n, 3), shuttle=(n, 3), rate=(n,), phase=(n,)
+        )
+        for name, shape in (shapes | {"period": (n,)}).items():
+            setattr(self, name, broadcast_rows(getattr(self, name), name, shape, is_finite=name in shapes))
         if not (self.period > 0).all():
             raise ValueError("period: not above 0")
         check_poses(np.concatenate([self.position, self.rotation], axis=1), "rotation")

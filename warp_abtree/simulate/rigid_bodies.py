@@ -1,6 +1,6 @@
 """Rigid bodies that respond to the contacts of their meshes: `Dynamics`.
 
-One step: contacts where the bodies stand, and where they first meet as far ahead as they move (`AheadQuery`); gravity;
+One step: contacts where the bodies stand, and where they first meet as far ahead as they move; gravity;
 contact impulses by projected Gauss-Seidel with warm starting and Coulomb friction; position correction by split
 impulses; semi-implicit Euler with a symplectic rotation; with `continuous`, motions cut where surfaces would meet. All
 in float64; docs/dynamics.md has each part, what is conserved and repeated, figures, and limits.
@@ -13,16 +13,17 @@ import warp as wp
 
 from warp_abtree.checks.arguments import finite_array, flag, positive
 from warp_abtree.checks.regime import current_regime
+from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.base.arrays import LAST_KEY
 from warp_abtree.kernels.bodies import bodies as body_kernels
 from warp_abtree.kernels.bodies import constraints as constraint_kernels
 from warp_abtree.kernels.bodies import graph_coloring, solve
 from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT
-from warp_abtree.query.manifold import POINTS_MAX
 from warp_abtree.query.request import Buffers, check_capacity
+from warp_abtree.query.stages.points import POINTS_MAX, ManifoldQuery
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.body_state import RigidBodies, zeros_of
-from warp_abtree.simulate.contacts_ahead import AheadQuery
+from warp_abtree.simulate.body_state import RigidBodies
+from warp_abtree.simulate.contacts_ahead import AheadGapStage
 from warp_abtree.simulate.continuous import CertifiedMotions
 
 SHELL = 0.75 * float(body_kernels.LOOKAHEAD_LEAST)  # with continuous bodies rest half a slop apart or more, in reach
@@ -53,7 +54,7 @@ class Dynamics(RigidBodies):
     Attributes:
         bodies, mass, rigid, kinematic: As `RigidBodies`.
         certified: With `continuous`, `CertifiedMotions`, what the last step made of each motion; else None.
-        query: The `AheadQuery` of the last step: its pairs, contacts and contact points.
+        query: The `ManifoldQuery` of the last step: its pairs, contacts and contact points.
         constraints: Their impulses and colors, `kernels.bodies.constraints.Constraints`.
 
     Raises:
@@ -77,7 +78,7 @@ class Dynamics(RigidBodies):
             raise ValueError(f"friction {friction!r} is below 0")
         by_color = current_regime().relax_by_color
         self._by_color = not self.device.is_cpu if by_color is None else by_color
-        self.query = AheadQuery(scene, self.bodies, capacity)
+        self.query = ManifoldQuery(scene, None, capacity, gap=AheadGapStage(scene, self.bodies))
         self.certified = None
         if flag(continuous, "continuous"):
             self.certified = CertifiedMotions(scene, self.bodies, Buffers(pairs=check_capacity(capacity).pairs))
@@ -258,10 +259,7 @@ class Dynamics(RigidBodies):
 class SteppedMotion:
     """Steps of `Dynamics` as the motion of a `Frame`: each frame finds the contacts once, and responds to them.
 
-    Args:
-        dynamics: `Dynamics`.
-        prescribed: `Kinematic`, or anything with its `poses`, for all objects: kinematic ones follow it. None leaves
-            them where they are.
+    Kinematic objects follow what is prescribed, `Kinematic` or anything with its `poses`, or stay where they are.
     """
 
     def __init__(self, dynamics: Dynamics, prescribed=None):

@@ -120,6 +120,7 @@ class StateArrays(DeviceMemory):
         pool: `StatePool` for kernels, longer than what is in use. Growing replaces its arrays, which captured graphs
             cannot follow.
         generation: Of the arrays of the pool; retired where the scene makes others.
+        growths: How often it has grown.
         slots: Host side of each state.
         free: Ids of states that no object uses, by model.
         torn: Whether a change of LODs was interrupted: states hold what no LOD explains until `reset`.
@@ -132,6 +133,7 @@ class StateArrays(DeviceMemory):
         self.slots: list[Slot] = []
         self.free: dict[int, list[int]] = {}
         self.torn = self._touched = False
+        self.growths = 0
         self.node_total = 0
         self.face_total = 0
         self._uploaded = 0
@@ -140,13 +142,18 @@ class StateArrays(DeviceMemory):
         self._allocate_faces(0)
         self._allocate_slots(SLOTS_LEAST)
 
+    def _grow(self):
+        """Count a replacement of arrays."""
+        self.growths += 1
+        self.generation.advance()
+
     def _allocate_nodes(self, count):
         old, kept = self.pool, self.node_total
         mark = wp.zeros(count // 32 + 1, dtype=wp.uint32, device=self.device)
         box = wp.empty(2 * count, dtype=wp.vec4, device=self.device)
         if kept:
             wp.copy(box, old.node_box, count=2 * kept)
-        self.generation.advance()
+        self._grow()
         self.pool.node_mark, self.pool.node_box = mark, box
         wp.launch(clear_node_kernel, count - kept, [kept, self.pool], device=self.device)
         self.node_room = count
@@ -156,7 +163,7 @@ class StateArrays(DeviceMemory):
         array = wp.full(count, wp.vec4i(-1, -1, -1, -1), dtype=wp.vec4i, device=self.device)
         if kept:
             wp.copy(array, old.face_corner, count=kept)
-        self.generation.advance()
+        self._grow()
         self.pool.face_corner = array
         self.face_room = count
 
@@ -166,7 +173,7 @@ class StateArrays(DeviceMemory):
         for name, array in made.items():
             if kept:
                 wp.copy(array, getattr(self.pool, name), count=kept)
-        self.generation.advance()
+        self._grow()
         for name, array in made.items():
             setattr(self.pool, name, array)
         self.slot_room = count
@@ -285,19 +292,22 @@ class ObjectArrays(DeviceMemory):
         self.generation = Generation(device)
         self._pointed = 0
 
-    def stage_states(self, state, generation: Generation):
+    def stage_states(self, state, states: StateArrays):
         """Return what `set_states` needs to point objects at states of a pool that has grown; None where it has not.
 
         A graph that was captured before reads the array that it knows: its tree states are none of the new ones.
         """
-        if generation.number == self._pointed:
+        if states.growths == self._pointed:
             return None
-        return wp.array(state, dtype=wp.int32, device=self.device), generation.number
+        return wp.array(state, dtype=wp.int32, device=self.device), states
 
     def set_states(self, state, staged=None):
         """Point every object at a state, int32 (n,)."""
         if staged is None:
             self.pool.state.assign(np.asarray(state, np.int32))
         else:
-            self.pool.state, self._pointed = staged
+            # What has failed since the pool has grown may have launched on the array that stood here.
+            array, states = staged
+            states.generation.advance()
+            self.pool.state, self._pointed = array, states.growths
         self.state = np.asarray(state, np.int32)

@@ -50,7 +50,7 @@ class Batch(DeviceMemory):
         self.mean_faces = float(models.face_count[self.object_model].mean()) if len(self.object_model) else 1.0
         self.solids = SolidArrays(models, states, solid) if np.any(solid) else None
         self._retired = False
-        self._trees, self._trees_made = Trees(), ()
+        self._trees, self._trees_made = Trees(), (-1, 0, 0)
 
     @property
     def lods(self) -> np.ndarray:
@@ -120,7 +120,7 @@ class Batch(DeviceMemory):
             update = LodUpdate(self.models, states, moves)
             for state, model in zip(ids, models, strict=True):
                 serving[self.object_model == model] = state
-            staged = self.objects.stage_states(serving, states.generation)
+            staged = self.objects.stage_states(serving, states)
             update.launch()
             self.objects.set_states(serving, staged)
         self._fit_solids()

@@ -221,7 +221,7 @@ def replace_states(
     ids = np.array(states.reserve([model for model, _ in wanted]), np.int32)
     moves = [(state, lod, -1) for state, (_, lod) in zip(ids.tolist(), wanted, strict=True)]
     update, chosen = LodUpdate(models, states, moves), ids[serving]
-    staged = objects.stage_states(chosen, states.generation)
+    staged = objects.stage_states(chosen, states)
     update.launch()
     states.free_others(ids)
     objects.set_states(chosen, staged)
@@ -246,7 +246,7 @@ def set_object_lods(
     update = LodUpdate(models, states, moves)
     serving = np.array([chosen[key] for key in wanted], np.int32)[inverse.reshape(-1)]
     moved = not np.array_equal(serving, objects.state)
-    staged = objects.stage_states(serving, states.generation) if moved else None
+    staged = objects.stage_states(serving, states) if moved else None
     update.launch()
     if moved:
         for state in used - set(chosen.values()):

@@ -7,7 +7,7 @@ the numbers of `docs/exactness.md`, by the parity of the crossings of a ray (`wa
 the LODs of the objects, it says nothing of the originals. Of an object pair that intersects in this way alone
 
 * any is True, count is 0, and it has no faces and no contacts: these are of surfaces; contact points it has, see
-  `warp_abtree.query.manifold`;
+  `query.stages.points`;
 * apart is False, whatever `within` is;
 * distance and bracket are 0, both points are a corner of the component that is inside, and point_faces names its face,
   beside -1 for the solid.

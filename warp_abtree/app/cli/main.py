@@ -76,11 +76,7 @@ def terminate(number, frame):
 
 
 def main(argv=None) -> int:
-    """Run the command line and return its exit status.
-
-    Args:
-        argv: Arguments without the program's name; None for those of the process, which then handles signals, too.
-    """
+    """Run the command line, with arguments of its own or, for None, those of the process; return its exit status."""
     progress = Progress()
     try:
         if argv is None:

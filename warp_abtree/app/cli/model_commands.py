@@ -51,9 +51,9 @@ def lod_at(option, model, request) -> int:
         raise ValueError(f"{option}: {error}") from None
 
 
-def active_count(model, lod) -> int:
-    """Return the active faces of a model at a LOD."""
-    return len(model.mesh_at(lod)[2])
+def diagonal_of(model) -> float:
+    """Return the diagonal of the original's box, which tells meshes of different units apart [model units]."""
+    return float(np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0)))
 
 
 def add_info_arguments(sub: Parser):
@@ -79,7 +79,7 @@ def _describe_model(path) -> dict:
     found = describe_mesh(mesh_from_arrays(forest.vertex_pos[: model.vertex_count], forest.face_vertex, model.name))
     for key in ("parts", "file_vertices", "unreferenced_vertices", "welded_vertices"):
         del found[key]  # a model does not keep them
-    return found | {"lods": model.lod_max + 1, "base_faces": active_count(model, 0)}
+    return found | {"lods": model.lod_max + 1, "base_faces": forest.active_count(0)}
 
 
 def add_build_arguments(sub: Parser):
@@ -139,7 +139,7 @@ def _build_file(mesh, file, options, progress) -> dict:
         progress("outward bounds", len(rows), len(LISTED_FRACTIONS))
         lod = model.lod_for(fraction=fraction)
         errors = {f"error_{side}": model.error_at(lod, side=side) for side in ("inward", "outward")}
-        rows.append({"share": fraction, "lod": lod, "faces": active_count(model, lod), **errors})
+        rows.append({"share": fraction, "lod": lod, "faces": model.progressive.active_count(lod), **errors})
     progress.close()
     return {
         "file": str(file),
@@ -148,8 +148,8 @@ def _build_file(mesh, file, options, progress) -> dict:
         "vertices": model.vertex_count,
         "dropped_faces": len(model.dropped_faces),
         "lods": model.lod_max + 1,
-        "base_faces": active_count(model, 0),
-        "diagonal": float(np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0))),
+        "base_faces": model.progressive.active_count(0),
+        "diagonal": diagonal_of(model),
         "seconds": seconds,
         "errors": rows,
     }

@@ -16,13 +16,9 @@ NOTICE_DELAY = 1.5  # seconds of compiling before a word about it
 
 
 class Progress:
-    """On a terminal a bar of rich, where that is installed; otherwise lines. Short stages are not shown.
+    """On a terminal a bar of rich, where that is installed; otherwise lines. Stages within a delay [s] are not shown.
 
     A stage begins with a line; a long one says how much is done and what is left, each time after twice as long.
-
-    Args:
-        stream: Where to write; None for sys.stderr.
-        delay: Seconds before a stage is shown.
     """
 
     def __init__(self, stream=None, delay=0.5, clock=time.monotonic):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.app.cli.arguments import LOD_HELP, MESHES, PRECISION_NAMES, Parser
-from warp_abtree.app.cli.model_commands import active_count, load_model, lod_at
+from warp_abtree.app.cli.model_commands import diagonal_of, load_model, lod_at
 from warp_abtree.app.cli.report import check_output, print_result, show_number
 from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.model.files.found import MeshError
@@ -68,8 +68,8 @@ def query(options, progress):
         "count": None if found.count is None else int(found.count[0]),
         "bound": sum(model.error_at(lod) for model, lod in zip(models, lods)),
         "lods": lods,
-        "diagonals": [_diagonal(model) for model in models],
-        "active_faces": [active_count(model, lod) for model, lod in zip(models, lods)],
+        "diagonals": [diagonal_of(model) for model in models],
+        "active_faces": [model.progressive.active_count(lod) for model, lod in zip(models, lods)],
         "node_tests": int(found.node_tests[0]),
         "triangle_tests": int(found.triangle_tests[0]),
         "milliseconds": spent,
@@ -84,7 +84,9 @@ def query(options, progress):
             result["distance"] = f"farther than {show_number(result.pop('bracket')[0])}"
             del result["points"], result["point_faces"]
     if found.contacts is not None:
-        result |= {"contacts": _flat_contacts(found.contacts), "pair_contacts": _named(found.pair_contacts[0])}
+        names = found.contacts.dtype.names[2:]
+        rows = [{"face_a": r["faces"][0], "face_b": r["faces"][1], **_named(r, names)} for r in found.contacts]
+        result |= {"contacts": rows, "pair_contacts": _named(found.pair_contacts[0])}
     if options.record:
         record_found(found, options.record)
         result["written"] = [str(options.record)]
@@ -118,17 +120,6 @@ def _make_scene(options, progress):
     except ValueError as error:
         raise ValueError(f"--{error}") from None
     return scene, models
-
-
-def _diagonal(model) -> float:
-    """Return the diagonal of the original's box, which tells meshes of different units apart [model units]."""
-    return float(np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0)))
-
-
-def _flat_contacts(contacts) -> list[dict]:
-    """Return the contacts of one object pair as a dictionary each, their faces under `face_a` and `face_b`."""
-    names = contacts.dtype.names[2:]
-    return [{"face_a": row["faces"][0], "face_b": row["faces"][1], **_named(row, names)} for row in contacts]
 
 
 def _named(row, names=None) -> dict:

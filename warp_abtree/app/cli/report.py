@@ -77,11 +77,7 @@ def print_table(rows):
 
 
 def check_output(path, suffixes, inputs=(), make=False):
-    """Refuse a file that could not be written, or that is one of the inputs, before any work.
-
-    Args:
-        make: Whether its folder will be made in the one above.
-    """
+    """Refuse a file that could not be written, unless `make` makes its folder, or that is read, before any work."""
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path}: the name must end in {' or '.join(suffixes)}")
     folder = path.parent.parent if make and not path.parent.exists() else path.parent

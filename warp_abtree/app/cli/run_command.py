@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.app.cli.arguments import PROGRAM, Parser, milliseconds, positive_count
-from warp_abtree.app.cli.model_commands import active_count
 from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.app.pictures.plots import draw_run
 from warp_abtree.app.pictures.render import import_pyvista
@@ -73,7 +72,7 @@ def run(options, progress):
         "time_step": loaded.time_step,
         "models": len(loaded.scene.models),
         "meshes": {
-            name: {"mesh": model.name, "faces": model.face_count, "base_faces": active_count(model, 0)}
+            name: {"mesh": model.name, "faces": model.face_count, "base_faces": model.progressive.active_count(0)}
             for name, model in loaded.models.items()
         },
         "worlds": len(np.unique(loaded.worlds[loaded.worlds >= 0])),

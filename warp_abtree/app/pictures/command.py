@@ -55,17 +55,18 @@ def picture(options, progress):
     if not len(objects):
         raise ValueError(f"--world: no object is in world {world}")
     settings = Settings(world, distances=options.distances)
+    drawn = objects, options.out, playback.title, (eye, up), settings, options.size
+    found = {"picture": str(options.out), "objects": len(objects)}
     if options.frames is None:
         snapshot = go_to(playback, options.frame, settings.output, progress)
         progress.close()
-        draw_snapshot(playback.scene, snapshot, objects, options.out, playback.title, (eye, up), settings, options.size)
-        print_result({"picture": str(options.out), "objects": len(objects), "frame": snapshot.number}, options.json)
+        draw_snapshot(playback.scene, snapshot, *drawn)
+        print_result({**found, "frame": snapshot.number}, options.json)
         return
     frames = range(options.frame, options.frame + options.frames, options.every)
-    snapshots = run_frames(playback, frames, settings.output, progress)
-    draw_frames(playback.scene, snapshots, objects, options.out, playback.title, (eye, up), settings, options.size)
+    draw_frames(playback.scene, run_frames(playback, frames, settings.output, progress), *drawn)
     progress.close()
-    print_result({"picture": str(options.out), "objects": len(objects), "frames": len(frames)}, options.json)
+    print_result({**found, "frames": len(frames)}, options.json)
 
 
 def _check(options):
@@ -95,10 +96,4 @@ def run_frames(playback, frames: range, output, progress=None):
 
 def go_to(playback, frame: int, output, progress=None) -> Snapshot:
     """Return the snapshot of a frame; a scene runs the frames before it."""
-    if frame == 0:
-        return playback.query(output)
-    for done in range(frame + 1):
-        snapshot = playback.step(output if done == frame else "count")
-        if progress is not None:
-            progress("frames", done + 1, frame + 1)
-    return snapshot
+    return next(run_frames(playback, range(frame, frame + 1), output, progress)) if frame else playback.query(output)

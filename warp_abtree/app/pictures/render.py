@@ -36,11 +36,7 @@ class Panel:
 
 
 def import_pyvista(what: str):
-    """Return pyvista, silent; `what` names what needs it.
-
-    Raises:
-        ValueError: pyvista, Matplotlib, or any OpenGL that draws without a display is missing.
-    """
+    """Return pyvista, silent; raise ValueError where `what` lacks it, Matplotlib, or an OpenGL without a display."""
     try:
         import matplotlib  # noqa: F401
         import pyvista
@@ -106,13 +102,7 @@ def camera_of(panels: list[Panel], eye, up) -> Camera:
 
 
 def draw(panels: list[Panel], path, title: str, legend, eye, up, size: int = 620):
-    """Write panels side by side, seen by one camera, to a PNG file.
-
-    Args:
-        legend: (colour, label) of each entry below.
-        eye, up: Directions to the eye and upwards in the world.
-        size: Pixels along a panel's side.
-    """
+    """Write panels side by side, seen from `eye` by one camera, above a legend of (colour, label), to a PNG file."""
     import_pyvista("a picture")
     camera = camera_of(panels, eye, up)
     images = crop([render(panel, camera, size) for panel in panels])

@@ -14,11 +14,7 @@ SIZE = 800  # pixels
 
 
 def make_panel(cache: geometry.MeshCache, data: RenderData, title: str | None = None) -> Panel:
-    """Return a picture of render data.
-
-    Args:
-        title: First line of the title; None counts objects and faces.
-    """
+    """Return a picture of render data; without a first line, `title` counts objects and faces."""
     triangles, colours = [], []
     for key, members in geometry.group_objects(data.keys, data.shown).items():
         vertices, faces, _ = cache.mesh(*geometry.split_key(key))
@@ -57,12 +53,7 @@ def draw_snapshot(scene: Scene, snapshot: Snapshot, shown, path, title: str, vie
 
 
 def draw_frames(scene: Scene, snapshots, shown, path, title: str, view, settings: Settings, size: int):
-    """Draw the shown objects of snapshots, in equal steps of time, to a WebP or GIF file, seen by one camera.
-
-    Args:
-        snapshots: Yields two or more.
-        view: Directions to the eye and upwards.
-    """
+    """Draw two or more snapshots, equal steps of time apart, to a WebP or GIF file; `view` as for `draw_snapshot`."""
     cache, panels, seen, times = geometry.MeshCache(scene), [], [], []
     for snapshot in snapshots:
         data = compose(cache, snapshot, shown, settings)
@@ -94,13 +85,9 @@ def draw_scene(loaded, path, time: float, poses=None, lods=None):
 
     Args:
         loaded: What `load_scene` returned.
-        path: PNG file to write.
         time: Time of the poses [s], unless the file's `[picture]` has one.
         poses: Pose of every object, (n, 7), in the place of those of the time.
         lods: LOD of every object, (n,), for one panel in the place of the file's.
-
-    Raises:
-        ValueError: The world to draw has no object, or pyvista is not installed.
     """
     scene, view = loaded.scene, loaded.picture
     time = time if view.time is None else view.time
@@ -127,6 +114,6 @@ def _swept_title(scene, data, model) -> str:
     """Return the LODs at which a panel shows a swept model, and its faces."""
     keys = [geometry.split_key(key) for key in data.keys[data.shown]]
     lods = [lod for owner, lod in keys if scene.models[owner] is model]
-    faces = sum(len(model.mesh_at(lod)[2]) for lod in lods)
+    faces = sum(model.progressive.active_count(lod) for lod in lods)
     span = f"{min(lods):,}" if min(lods) == max(lods) else f"{min(lods):,} to {max(lods):,}"
     return f"{model.name} at LOD {span} of {model.lod_max:,}: {faces:,} faces"

@@ -1,18 +1,14 @@
 """The table [lod] of a scene file: the controller that chooses the LODs of a run."""
 
+import inspect
 from dataclasses import dataclass, field, replace
 
 from warp_abtree.app.toml.errors import fail
 from warp_abtree.lod.controllers import PaperController, PredictiveController, ToleranceController
 from warp_abtree.scene.scene import Scene
 
-CONTROLLERS = ("predictive", "paper", "tolerance", "none")
-# The options of [lod] that each controller takes.
-_OPTIONS = {
-    "predictive": ("steps", "spacing", "window", "aim", "low", "hold_frames", "loosest"),
-    "paper": ("steps", "window", "threshold_ms"),
-    "tolerance": ("steps", "spacing", "window", "loosest"),
-}
+_KINDS = {"predictive": PredictiveController, "paper": PaperController, "tolerance": ToleranceController}
+CONTROLLERS = (*_KINDS, "none")
 
 
 @dataclass(frozen=True)
@@ -27,8 +23,7 @@ class LodControl:
     def asked(self, controller: str | None = None, budget_ms: float | None = None) -> "LodControl":
         """Return this with another controller or budget; a budget alone asks the predictive one where none holds it.
 
-        Raises:
-            ValueError: A controller without its budget or tolerance.
+        Raises ValueError for a controller without its budget or tolerance.
         """
         if controller is None:
             keeps = budget_ms is None or self.controller in ("predictive", "paper")
@@ -48,19 +43,13 @@ class LodControl:
         """Return the controller for a scene, None for "none"."""
         if self.controller == "none":
             return None
-        options = {name: value for name, value in self.options.items() if name in _OPTIONS[self.controller]}
-        if self.controller == "tolerance":
-            return ToleranceController(scene, self.tolerance, camera, **options)
-        kind = PaperController if self.controller == "paper" else PredictiveController
-        return kind(scene, self.budget_ms, camera, **options)
+        kind, held = _KINDS[self.controller], self.tolerance if self.controller == "tolerance" else self.budget_ms
+        taken = inspect.signature(kind).parameters
+        return kind(scene, held, camera, **{name: value for name, value in self.options.items() if name in taken})
 
 
 def make_control(path, table) -> LodControl:
-    """Return what [lod] describes.
-
-    Raises:
-        SceneError: A controller without its budget or tolerance.
-    """
+    """Return what [lod] describes; raise SceneError for a controller without its budget or tolerance."""
     if table is None:
         return LodControl()
     from msgspec.structs import asdict

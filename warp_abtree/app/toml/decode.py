@@ -2,6 +2,7 @@
 
 import math
 import re
+from itertools import accumulate
 from pathlib import Path
 
 from warp_abtree.app.toml.errors import SceneError, fail
@@ -28,22 +29,12 @@ TOML_TYPES = {
 }
 
 
-def import_msgspec(path):
-    """Return msgspec, which reads a file.
-
-    Raises:
-        SceneError: It is not installed.
-    """
+def read_tables(path: Path, text: str | None = None):
+    """Return the `SceneTable` of a scene file, or of `text` in its place; its models are `ModelTable`s."""
     try:
         import msgspec
     except ImportError:
         raise SceneError(f"{path}: scene files need msgspec: pip install msgspec") from None
-    return msgspec
-
-
-def read_tables(path: Path, text: str | None = None):
-    """Return the `SceneTable` of a scene file, or of `text` in its place; its models are `ModelTable`s."""
-    msgspec = import_msgspec(path)
     from warp_abtree.app.toml import tables
 
     try:
@@ -103,12 +94,9 @@ def _check_text(path, text: str):
 
 def _deepest_line(text: str) -> int:
     """Return the line at which the most brackets are open."""
-    line, depth, deepest = 1, 0, (0, 1)
-    for found in re.finditer(r"[\[{\]}\n]", text):
-        line += found[0] == "\n"
-        depth += (found[0] in "[{") - (found[0] in "]}")
-        deepest = max(deepest, (depth, -line))
-    return abs(deepest[1])
+    brackets = list(re.finditer(r"[\[{\]}]", text))
+    depths = list(accumulate(1 if found[0] in "[{" else -1 for found in brackets))
+    return text.count("\n", 0, brackets[depths.index(max(depths))].start()) + 1
 
 
 def _check_values(path, key, value, depth=0):
@@ -143,10 +131,9 @@ def _explain(error: str, where: str, choices: dict) -> tuple[str, str]:
     names = choices.get(key.rpartition(".")[2])
     if message.startswith("Invalid") and names:
         return key.strip("."), f"{message.split(' ')[-1]} is none of {', '.join(names)}"
-    message = re.sub(r"`([a-z |]+)`", lambda found: _in_toml(found[1]), message)
+    message = re.sub(
+        r"`([a-z |]+)`",
+        lambda found: " or ".join(TOML_TYPES.get(name, name) for name in found[1].split(" | ") if name != "null"),
+        message,
+    )
     return key.strip(".") or "the file", message[0].lower() + message[1:]
-
-
-def _in_toml(types: str) -> str:
-    """Return types of msgspec, as "int | null", in the words of TOML."""
-    return " or ".join(TOML_TYPES.get(name, name) for name in types.split(" | ") if name != "null")

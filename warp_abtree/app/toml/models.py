@@ -2,7 +2,6 @@
 
 import importlib.util
 import math
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import trimesh
 
 from warp_abtree.app.toml.errors import fail
 from warp_abtree.app.toml.shapes import FACE_BOUNDS, GENERATED
+from warp_abtree.checks.arguments import warn_caller
 from warp_abtree.model.mesh import Mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model
 
@@ -18,13 +18,9 @@ SCENE_FACE_LIMIT = 2**22  # of all models of a file that are generated; a face t
 
 
 def check_faces(path: Path, tables: dict):
-    """Refuse models whose faces would exhaust the memory, before any is made.
+    """Refuse models, `ModelTable`s by name, whose faces would exhaust the memory, before any is made.
 
-    Args:
-        tables: `ModelTable`s by name.
-
-    Raises:
-        SceneError: Shapes, and meshes that are brought to a number of faces, have more than SCENE_FACE_LIMIT together.
+    Counted are shapes, and meshes that are brought to a number of faces: SCENE_FACE_LIMIT together.
     """
     total = 0
     for name, table in tables.items():
@@ -38,15 +34,11 @@ def check_faces(path: Path, tables: dict):
 
 
 def build_model(path: Path, name: str, table, progress=None) -> Model:
-    """Build the model that [models.NAME] describes.
-
-    Raises:
-        SceneError: A mesh is missing or bad, or its coordinates leave the range of numbers.
-    """
+    """Build the model that [models.NAME] describes; raise SceneError where its mesh is missing, bad or out of range."""
     mesh = _load(path, name, table)
     if mesh.parts > 1:
         about = f"the {mesh.parts} parts of {table.mesh} are joined into one mesh"
-        warnings.warn(f"{path}: models.{name}: {about}; scene_from_file makes an object of each", stacklevel=2)
+        warn_caller(f"{path}: models.{name}: {about}; scene_from_file makes an object of each", UserWarning)
     try:
         lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         vertices = mesh.vertices - (lower / 2 + upper / 2) if table.centre else mesh.vertices

@@ -31,8 +31,7 @@ class ObjectGroup:
 def make_group(path, key: str, table, dynamics, rng, room: int) -> ObjectGroup:
     """Lay out the copies of the entry `key`, an `ObjectTable`; `rng` draws what is random.
 
-    Raises:
-        SceneError: More copies than there is room for, or keys of rigid bodies where there are none.
+    Raises SceneError for more copies than there is room for, or keys of rigid bodies where there are none.
     """
     _check_dynamics(path, key, table, dynamics)
     layer = 1 if table.grid is None else math.prod(n for n in table.grid.size if n)
@@ -115,13 +114,7 @@ def _scatter(table, motion, rng):
 
 
 def make_groups(path, tables, dynamics, seed: int, objects: int | None = None) -> list[ObjectGroup]:
-    """Lay out all entries of [[objects]].
-
-    Args:
-        seed: Of what is random.
-        objects: About so many objects in all: every `worlds`, or else `count`, is multiplied by the same number; None
-            keeps them.
-    """
+    """Lay out all entries of [[objects]], what is random by a seed; `objects` as for `load_scene`."""
 
     def make(tables):
         made, room = [], OBJECT_LIMIT

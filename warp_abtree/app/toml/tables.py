@@ -367,8 +367,4 @@ class SceneTable(Table, kw_only=True):
 
 
 # Keys whose values are names, and the names.
-CHOICES = {
-    "controller": get_args(ControllerName),
-    "spacing": get_args(Spacing),
-    "shape": tuple(SHAPES),
-}
+CHOICES = {"controller": get_args(ControllerName), "spacing": get_args(Spacing), "shape": tuple(SHAPES)}

@@ -1,4 +1,4 @@
-"""`warp-abtree view`: a page in the browser about a scene or meshes."""
+"""The viewer: `warp-abtree view` of a scene or meshes, and `view` of a scene made in Python."""
 
 import contextlib
 import gc
@@ -9,8 +9,9 @@ import socket
 
 from warp_abtree.app.cli.arguments import Parser, milliseconds
 from warp_abtree.app.open_playback import add_playback_arguments, open_playback
-from warp_abtree.app.playback import Playback
+from warp_abtree.app.playback import Playback, StillPlayback
 from warp_abtree.app.viewer.guard import refuse_foreign
+from warp_abtree.scene.scene import Scene
 
 HOST, PORT = "127.0.0.1", 8080
 SUMMARY = "look at a scene or meshes in the browser"
@@ -30,11 +31,7 @@ def add_arguments(sub: Parser):
 
 
 def import_viser():
-    """Return viser, silent.
-
-    Raises:
-        ValueError: It is not installed.
-    """
+    """Return viser, silent; raise ValueError where it is not installed."""
     try:
         import viser
     except ImportError as error:
@@ -45,11 +42,7 @@ def import_viser():
 
 
 def check_port(host, port):
-    """Refuse an address that cannot be served at.
-
-    Raises:
-        ValueError: No such address, no such port, or another program has it.
-    """
+    """Raise ValueError for no address, no port, or one that another program has."""
     if not 0 <= port <= 65535:
         raise ValueError(f"--port: {port} is outside 0 .. 65535")
     try:
@@ -93,11 +86,7 @@ def run_viewer(options, progress):
 
 
 def show(playback: Playback, host=HOST, port=None, as_json=False, seconds=None):
-    """Serve a page about a playback until Ctrl-C, or for a time [s]; print its address.
-
-    Raises:
-        ValueError: The address cannot be served at.
-    """
+    """Serve a page about a playback until Ctrl-C, or for a time [s]; print its address, or raise ValueError."""
     from warp_abtree.app.viewer.page import Page
 
     with serve(host, PORT if port is None else port) as server:
@@ -110,3 +99,30 @@ def show(playback: Playback, host=HOST, port=None, as_json=False, seconds=None):
         with contextlib.suppress(KeyboardInterrupt):  # from when the address is told
             print(json.dumps(found) if as_json else f"{playback.title}: {address} (Ctrl-C ends)", flush=True)
             page.run(seconds)
+
+
+def view(scene: Scene, title="scene", host=HOST, port=None, seconds=None):
+    """Show a scene in the browser, as it stands: print the address, and serve until Ctrl-C.
+
+    The page sets LODs, which are those of before at the end; poses stay. Waits for the device.
+
+    Args:
+        scene: `Scene` with objects.
+        title: What the page is called.
+        host, port: Where to serve: this machine alone at 8080, or the next port that is free.
+        seconds: How long [s]; None is until Ctrl-C.
+
+    Raises:
+        TypeError: scene is no Scene.
+        ValueError: viser is not installed, the scene has no object, or the address cannot be served at.
+    """
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene is a {type(scene).__name__}, not a Scene")
+    import_viser()
+    check_port(host, 0 if port is None else port)
+    lods = scene.lods
+    try:
+        show(StillPlayback(scene, title), host, port, seconds=seconds)
+    finally:
+        if scene.object_count:
+            scene.set_lods(lods)

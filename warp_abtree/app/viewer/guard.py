@@ -59,11 +59,7 @@ def _address(text: str | None):
 
 @contextlib.contextmanager
 def refuse_foreign(host: str):
-    """Let a server of websockets that is made meanwhile answer refused requests with 403.
-
-    Raises:
-        ValueError: None was made.
-    """
+    """Let a server of websockets that is made meanwhile answer refused requests with 403; raise ValueError for none."""
     import websockets.asyncio.server
 
     module: Any = websockets.asyncio.server

@@ -188,9 +188,12 @@ class Page:
         try:
             act(*arguments)
         except ValueError as error:
-            for client in self.server.get_clients().values():
-                client.add_notification("That cannot be", str(error), color="red", auto_close_seconds=8)
+            self._tell("That cannot be", error, auto_close_seconds=8)
         self._dirty = True
+
+    def _tell(self, what, error, **options):
+        for client in self.server.get_clients().values():
+            client.add_notification(what, str(error), color="red", **options)
 
     def advance(self):
         """Make the next snapshot, a frame on if it plays or steps, and send what changed."""
@@ -199,8 +202,7 @@ class Page:
             self.snapshot = (self.playback.step if moves else self.playback.query)(self.settings.output)
         except RuntimeError as error:
             self.playing = False
-            for client in self.server.get_clients().values():
-                client.add_notification("This frame failed", str(error), color="red")
+            self._tell("This frame failed", error)
         self._steps, self._dirty = max(self._steps - 1, 0), False
         self._data = compose(self.cache, self.snapshot, self.shown, self.settings)
         self._send()

@@ -67,14 +67,16 @@ class ViewerScene:
                 node.sent[name] = array
                 self.sent += array.nbytes
 
-    def _visible(self, node: _Node, visible: bool):
-        if node.sent.get("visible", True) != visible:
-            node.handle.visible = node.sent["visible"] = visible
+    def _set(self, node: _Node, name: str, value):
+        """Assign a value if another was sent last."""
+        if node.sent[name] != value:
+            setattr(node.handle, name, value)
+            node.sent[name] = value
 
-    def _added(self, handle, arrays) -> _Node:
-        """Keep what was just added."""
+    def _added(self, handle, arrays, visible=True, **values) -> _Node:
+        """Keep what was just added, with arrays and other values."""
         self.sent += sum(array.nbytes for array in arrays.values())
-        return _Node(handle, dict(arrays), self.clock())
+        return _Node(handle, {**arrays, "visible": visible, **values}, self.clock())
 
     def _mesh_arrays(self, key):
         vertices, faces, _ = self.cache.mesh(*geometry.split_key(key))
@@ -84,25 +86,22 @@ class ViewerScene:
 
     def _show_single(self, data, objects):
         for i in set(self._single) - set(objects.tolist()):
-            self._visible(self._single[i], False)
+            self._set(self._single[i], "visible", False)
         for i in objects.tolist():
             pose, colour, key = data.poses[i], tuple(data.colours[i].tolist()), int(data.keys[i])
             place = {"position": pose[:3].copy(), "wxyz": pose[[6, 3, 4, 5]]}
             node = self._single.get(i)
             if node is None:
                 arrays = {**self._mesh_arrays(key), **place}
-                name = f"/objects/{i}"
-                handle = self.api.add_mesh_simple(name, **arrays, color=colour, **PLAIN)
-                node = self._single[i] = self._added(handle, arrays)
-                node.sent["key"], node.sent["color"] = key, colour
+                handle = self.api.add_mesh_simple(f"/objects/{i}", **arrays, color=colour, **PLAIN)
+                self._single[i] = self._added(handle, arrays, key=key, color=colour)
                 continue
             if node.sent["key"] != key:
                 self._update(node, **self._mesh_arrays(key))
                 node.sent["key"] = key
-            if node.sent["color"] != colour:
-                node.handle.color = node.sent["color"] = colour
+            self._set(node, "color", colour)
             self._update(node, **place)
-            self._visible(node, True)
+            self._set(node, "visible", True)
 
     # Instances.
 
@@ -112,7 +111,7 @@ class ViewerScene:
         coming = geometry.group_objects(self._next, objects[self._next[objects] >= 0])
         for key, before in self._meshes.items():
             if key not in groups:
-                self._visible(before, False)
+                self._set(before, "visible", False)
         for key, members in (*groups.items(), *coming.items()):
             poses = data.poses[members].astype(np.float32)
             arrays = {
@@ -125,7 +124,7 @@ class ViewerScene:
                 node = self._add_instances(key, members, arrays, visible=key in groups)
             elif key in groups:
                 self._update(node, **arrays)
-                self._visible(node, True)
+                self._set(node, "visible", True)
             self._meshes[key] = node  # the last used stand last
         hidden = [key for key in self._meshes if key not in groups and key not in coming]
         for key in hidden[: max(len(hidden) - HIDDEN_MESHES, 0)]:
@@ -155,11 +154,8 @@ class ViewerScene:
     def _add_instances(self, key, members, arrays, visible) -> _Node:
         arrays = {**self._mesh_arrays(key), **arrays}
         name = "/meshes/{}/{}".format(*geometry.split_key(key))
-        options = {"lod": "off", "visible": visible}
-        handle = self.api.add_batched_meshes_simple(name, **arrays, **options, **PLAIN)
-        node = self._added(handle, arrays)
-        node.sent["visible"] = visible
-        return node
+        handle = self.api.add_batched_meshes_simple(name, **arrays, lod="off", visible=visible, **PLAIN)
+        return self._added(handle, arrays, visible)
 
     def _show_triangles(self, name, corners, colour):
         """Show triangles as a node of their own; without any hide it."""
@@ -172,7 +168,7 @@ class ViewerScene:
             self._layers[name] = self._added(handle, arrays)
         elif node is not None:
             self._update(node, **arrays)
-            self._visible(node, bool(arrays))
+            self._set(node, "visible", bool(arrays))
 
     def _show_distances(self, data):
         """Show the segments between nearest points, and the least distances in numbers at their middles."""
@@ -190,7 +186,7 @@ class ViewerScene:
                 self._show_distances(data)
                 return
             self._update(node, **({"points": data.nearest.astype(np.float32)} if count else {}))
-            self._visible(node, count > 0)
+            self._set(node, "visible", count > 0)
         self._show_labels(data)
 
     def _show_labels(self, data):
@@ -199,16 +195,14 @@ class ViewerScene:
             place = {"position": point}
             if k == len(self._labels):
                 handle = self.api.add_label(f"/distance/{k}", text=text, anchor="center-center", **place)
-                self._labels.append(self._added(handle, place))
-                self._labels[k].sent["text"] = text
+                self._labels.append(self._added(handle, place, text=text))
                 continue
             node = self._labels[k]
-            if node.sent["text"] != text:
-                node.handle.text = node.sent["text"] = text
+            self._set(node, "text", text)
             self._update(node, **place)
-            self._visible(node, True)
+            self._set(node, "visible", True)
         for node in self._labels[len(told) :]:
-            self._visible(node, False)
+            self._set(node, "visible", False)
 
 
 def _linear(colours) -> np.ndarray:

@@ -7,6 +7,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.checks.device_memory import DeviceMemory
+from warp_abtree.checks.upload import struct_of
 from warp_abtree.interop.robot.link_query import LinkDistances, LinkHits, LinkRequest
 from warp_abtree.interop.robot.surroundings import RobotBatch
 from warp_abtree.kernels.robot.link_pairs import Parts
@@ -40,20 +41,21 @@ def make_link_request(robot, robots: RobotBatch, room: int) -> LinkRequest:
             entries.append((j, i, max(set(paths[i]) & set(paths[j]), default=-1)))
         if len(entries) > first:
             stages.append((first, len(entries)))
-    parts = Parts()
-    columns = np.array(entries, np.int32).reshape(-1, 3).T
-    parts.first, parts.second, parts.shared = (wp.array(c.copy(), dtype=wp.int32, device=device) for c in columns)
-    parts.meets = wp.array(robots.meets.astype(np.uint8), dtype=wp.uint8, device=device)
-    parts.frame = wp.array(np.array(frame, np.int32), device=device)
-    parts.depth = wp.array(np.array([len(path) for path in paths], np.int32), device=device)
-    middles = np.array([model.centre for model in robot.models])
-    parts.middle = wp.array(middles, dtype=wp.vec3d, device=device)
+    middles = [model.centre for model in robot.models]
     vertices = [model.progressive.vertex_pos[: model.progressive.vertex_count] for model in robot.models]
-    radii = [np.sqrt(((v - m) ** 2).sum(1).max()) * (1 + 2.0**-40) for v, m in zip(vertices, middles)]
-    parts.radius = wp.array(np.array(radii), dtype=wp.float64, device=device)
-    sizes = len(robot.joint_names), len(description.frames), len(frame)
+    columns = np.array(entries, np.int32).reshape(-1, 3).T
+    parts = struct_of(
+        Parts,
+        device,
+        **dict(zip(("first", "second", "shared"), columns)),
+        meets=robots.meets.astype(np.uint8),
+        frame=frame,
+        depth=[len(path) for path in paths],
+        middle=middles,
+        radius=[np.sqrt(((v - m) ** 2).sum(1).max()) * (1 + 2.0**-40) for v, m in zip(vertices, middles)],
+    )
     # A launch is one even where there is nothing to ask.
-    return LinkRequest(description.make_chain(device), parts, stages or [(0, 0)], robots.count, room, *sizes)
+    return LinkRequest(description.make_chain(device), parts, stages or [(0, 0)], robots.count, room)
 
 
 class RobotQuery(DeviceMemory):
@@ -71,29 +73,20 @@ class RobotQuery(DeviceMemory):
 
     def __init__(self, robot, around, output: str, room: int):
         self.device, self.output, self.room = robot.device, output, room
-        self._robots = made = RobotBatch(around, robot.models, room, robot.device)
+        self.robots = made = RobotBatch(around, robot.models, room, robot.device)
         request = make_link_request(robot, made, room)
         self._around, self._models = made.count, len(robot.models)
-        self._links: Any
-        capacity = max(1, PAIRS_GUESS * room)
-        if output == "distance":
-            self._links = LinkDistances(made.batch, request, capacity)
-        else:
-            self._links = LinkHits(made.batch, request, capacity, output == "within")
+        given = made.batch, request, max(1, PAIRS_GUESS * room)
+        self._links: Any = LinkDistances(*given) if output == "distance" else LinkHits(*given, output == "within")
         self.nearest = self._links.nearest
-        pairs = self._links.links
-        self.configurations, self._chunk = pairs.configurations, pairs.chunk
+        self.configurations, self._chunk = self._links.configurations, self._links.chunk
         self.hit = self._chunk.hit
         self._chunk.count.fill_(room)
         self.take_poses()
 
-    def is_of(self, around) -> bool:
-        """Return whether what surrounds the robot has the objects and LODs of before."""
-        return self._robots.is_of(around)
-
     def take_poses(self):
         """Read where what surrounds the robot is now. Launches only."""
-        self._robots.take_poses()
+        self.robots.take_poses()
 
     def launch(self):
         """Check all configurations. Launches only."""
@@ -106,7 +99,8 @@ class RobotQuery(DeviceMemory):
             CapacityError: A buffer overflowed; a graph is to be captured again.
             RuntimeError: There was no whole launch, see `Query.result`.
         """
-        self._links.guard.check(self._links.guard.outcome())
+        guard = self._links.query.guard
+        guard.check(guard.outcome())
         pairs, uncertain = self._links.demand.numpy().tolist()
         if self._links.make_room_for(pairs, uncertain):
             raise CapacityError(f"{pairs} pairs of objects, {uncertain} uncertain ones of faces; launch again")
@@ -126,20 +120,20 @@ class RobotQuery(DeviceMemory):
                 continue
             for name in ("distance", "points", "faces", "pair"):
                 part[name] = getattr(self.nearest, name)[:count].numpy()
-            self._number(part["pair"])
+            # Objects as models of the robot, and what surrounds it after these.
+            pairs = part["pair"]
+            own = np.where(pairs < self._around, pairs + self._models, (pairs - self._around) % self._models)
+            part["pair"] = np.where(pairs < 0, -1, own)
         return answers
 
     def _run(self, rows, first, count):
-        self._links.links.active = count
+        self._links.active = count
         self._chunk.count.fill_(count)
         width = self.configurations.shape[1]
         wp.copy(self.configurations, rows, src_offset=first * width, count=count * width)
-        self._links.run_stages()
-
-    def _number(self, pairs: np.ndarray):
-        """Number pairs of objects as models of the robot, and what surrounds it after these."""
-        part = (pairs - self._around) % self._models
-        pairs[:] = np.where(pairs < 0, -1, np.where(pairs < self._around, pairs + self._models, part))
+        self._links.launch()
+        while self._links.make_room_for(*self._links.demand.numpy().tolist()):
+            self._links.launch()
 
     def ask_spread(self, middles, halves, sizes) -> tuple[np.ndarray, np.ndarray]:
         """Return which configurations meet, and which are not proved apart for all that joint values may differ by.

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 
+from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.robot import forward
 from warp_abtree.model.mesh import Mesh, load_mesh
 from warp_abtree.scene.objects import ALL_BITS
@@ -20,23 +20,14 @@ class RobotError(ValueError):
 
 @dataclass
 class RobotFrame:
-    """A frame: its parent's, moved by a fixed transform, then by a joint.
+    """A frame: its parent's, moved by a fixed transform, then by a joint."""
 
-    Attributes:
-        parent: Index of an earlier frame, -1 for none.
-        origin: Fixed transform, float64 (4, 4), rigid [robot units].
-        kind: "fixed", "revolute" or "prismatic".
-        axis: Of the joint, unit, (3,).
-        joint: Name of the joint whose value moves it, None where it is fixed.
-        scale, offset: Value of this joint = scale * that of `joint` + offset.
-    """
-
-    parent: int
-    origin: np.ndarray
-    kind: str = "fixed"
-    axis: tuple = (0.0, 0.0, 1.0)
-    joint: str | None = None
-    scale: float = 1.0
+    parent: int  # index of an earlier frame, -1 for none
+    origin: np.ndarray  # fixed transform, float64 (4, 4), rigid [robot units]
+    kind: str = "fixed"  # or "revolute" or "prismatic"
+    axis: tuple = (0.0, 0.0, 1.0)  # of the joint, unit, (3,)
+    joint: str | None = None  # name of the joint whose value moves it, None where it is fixed
+    scale: float = 1.0  # value of this joint = scale * that of `joint` + offset
     offset: float = 0.0
 
 
@@ -52,26 +43,16 @@ class Part:
 
 @dataclass
 class Description:
-    """A robot as its file describes it.
+    """A robot as its file describes it."""
 
-    Attributes:
-        frames: Parents first.
-        joints: Limits (lower, upper) by the name of each joint that a configuration sets, in order [rad or robot
-            units].
-        links: Index of the frame of each link, by its name.
-        parts: Meshes of links; a link has none, one, or several whose bits differ.
-        excluded: Pairs of names of links that the file says are never tested.
-        demanded: Pairs of indices of parts that the file says are tested, whatever else would leave them out.
-        neighbours: Links that a joint joins and that are not tested: "all", "moving" for those that both move against
-            the root, "none".
-    """
-
-    frames: list[RobotFrame] = field(default_factory=list)
+    frames: list[RobotFrame] = field(default_factory=list)  # parents first
+    # Limits (lower, upper) by the name of each joint that a configuration sets, in order [rad or robot units].
     joints: dict[str, tuple[float, float]] = field(default_factory=dict)
-    links: dict[str, int] = field(default_factory=dict)
-    parts: list[Part] = field(default_factory=list)
-    excluded: set[frozenset] = field(default_factory=set)
-    demanded: set[frozenset] = field(default_factory=set)
+    links: dict[str, int] = field(default_factory=dict)  # index of the frame of each link, by its name
+    parts: list[Part] = field(default_factory=list)  # of links: a link has none, one, or several whose bits differ
+    excluded: set[frozenset] = field(default_factory=set)  # pairs of names of links that are never tested
+    demanded: set[frozenset] = field(default_factory=set)  # pairs of indices of parts that are tested, whatever else
+    # Links that a joint joins and that are not tested: "all", "moving" if both move against the root, "none".
     neighbours: str = "all"
 
     def bodies(self) -> np.ndarray:
@@ -122,32 +103,27 @@ class Description:
 
     def make_chain(self, device) -> forward.Chain:
         """Return the frames as device arrays."""
-        chain, columns = forward.Chain(), {name: k for k, name in enumerate(self.joints)}
-        frames, origins = self.frames, np.array([frame.origin for frame in self.frames])
-
-        def upload(values, dtype):
-            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
-        chain.parent = upload(np.array([frame.parent for frame in frames], np.int32), wp.int32)
-        chain.kind = upload(np.array([JOINT_KINDS[frame.kind] for frame in frames], np.int32), wp.int32)
-        moved = [-1 if frame.joint is None else columns[frame.joint] for frame in frames]
-        chain.column = upload(np.array(moved, np.int32), wp.int32)
-        chain.scale = upload(np.array([frame.scale for frame in frames]), wp.float64)
-        chain.offset = upload(np.array([frame.offset for frame in frames]), wp.float64)
-        chain.axis = upload(np.array([frame.axis for frame in frames], np.float64), wp.vec3d)
-        chain.rotation = upload(origins[:, :3, :3], wp.mat33d)
-        chain.position = upload(origins[:, :3, 3], wp.vec3d)
-        limits = np.array(list(self.joints.values()), np.float64).reshape(-1, 2)
-        chain.lower, chain.upper = upload(limits[:, 0], wp.float64), upload(limits[:, 1], wp.float64)
-        return chain
+        columns, frames = {name: k for k, name in enumerate(self.joints)}, self.frames
+        origins, limits = np.array([frame.origin for frame in frames]), np.array([*self.joints.values()], np.float64)
+        lower, upper = limits.reshape(-1, 2).T
+        return struct_of(
+            forward.Chain,
+            device,
+            parent=[frame.parent for frame in frames],
+            kind=[JOINT_KINDS[frame.kind] for frame in frames],
+            column=[-1 if frame.joint is None else columns[frame.joint] for frame in frames],
+            scale=[frame.scale for frame in frames],
+            offset=[frame.offset for frame in frames],
+            axis=[frame.axis for frame in frames],
+            rotation=origins[:, :3, :3],
+            position=origins[:, :3, 3],
+            lower=lower,
+            upper=upper,
+        )
 
 
 def unit_axis(axis, what: str) -> tuple:
-    """Return an axis of unit length.
-
-    Raises:
-        RobotError: It has no length, or is not finite.
-    """
+    """Return an axis of unit length; raise RobotError for one without a length, or that is not finite."""
     axis = np.asarray(axis, np.float64)
     size = np.linalg.norm(axis)
     if axis.shape != (3,) or not (np.isfinite(size) and size > 1e-12):
@@ -156,22 +132,14 @@ def unit_axis(axis, what: str) -> tuple:
 
 
 def check_names(names: list[str], what: str, path: Path):
-    """Refuse names of links or joints that are not each there once.
-
-    Raises:
-        RobotError: One comes again.
-    """
+    """Raise RobotError where a name of links or joints comes again."""
     for name, count in Counter(names).items():
         if count > 1:
             raise RobotError(f"{path}: {count} {what} have the name {name!r}")
 
 
 def check_rigid(matrix, what: str) -> np.ndarray:
-    """Return a transform as float64 (4, 4), identity for None.
-
-    Raises:
-        RobotError: It is not rigid.
-    """
+    """Return a transform as float64 (4, 4), identity for None; raise RobotError if it is not rigid."""
     matrix = np.eye(4) if matrix is None else np.asarray(matrix, np.float64)
     rotation = matrix[:3, :3]
     fine = np.isfinite(matrix).all() and np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-12
@@ -181,11 +149,7 @@ def check_rigid(matrix, what: str) -> np.ndarray:
 
 
 def join_meshes(placed, name: str) -> Mesh:
-    """Return meshes (vertices, faces, transform) as one, in the frame that they are placed in.
-
-    Raises:
-        MeshError: They make no mesh.
-    """
+    """Return meshes (vertices, faces, transform) as one where these put them; raise MeshError if they make none."""
     import trimesh
 
     scene = trimesh.Scene()

@@ -6,223 +6,169 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.device_memory import DeviceMemory
+from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.intersect.broad_phase import pose_box_kernel
 from warp_abtree.kernels.robot import answers, forward, link_pairs
-from warp_abtree.query.broad_phase import BroadPhase
-from warp_abtree.query.distance import DistanceQuery
-from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import Buffers
+from warp_abtree.query.stages.distance import DistanceQuery
+from warp_abtree.query.stages.intersect import Query
 from warp_abtree.state.batch import Batch
-from warp_abtree.state.generation import LaunchGuard
 
-CHECK_MODES = {
-    "any": int(link_pairs.ASK_ANY),
-    "within": int(link_pairs.ASK_WITHIN),
-    "distance": int(link_pairs.ASK_DISTANCE),
-}
+NO_PAIRS = np.zeros((0, 2), np.int32)
 
 
 @dataclass
 class LinkRequest:
-    """Request of a chunk's query: a robot's chain and parts, and the objects of the batch.
-
-    Attributes:
-        stages: (first, end) of the entries of `parts` that are asked one after the other.
-        around: Objects of the surroundings, which come first.
-        room: Configurations.
-        width: Numbers of a configuration.
-        frame_count, part_count: Of the robot.
-    """
+    """Request of a chunk's query: a robot's chain and parts, and the objects of the batch."""
 
     chain: forward.Chain
     parts: link_pairs.Parts
-    stages: list[tuple[int, int]]
-    around: int
-    room: int
-    width: int
-    frame_count: int
-    part_count: int
+    stages: list[tuple[int, int]]  # (first, end) of the entries of `parts` that are asked one after the other
+    around: int  # objects of the surroundings, which come first
+    room: int  # configurations
 
 
-class LinkPairs:
-    """Broad phase of a robot's parts: poses them by their configurations, and finds the pairs of a stage.
+class LinkQuery(DeviceMemory):
+    """A query given no pairs: a launch poses the parts, writes the pairs of each stage, a part first, and asks it.
+
+    Stages that a configuration needs no more are empty.
+
+    Args:
+        query: `Query` or `DistanceQuery` of the batch, without pairs.
+        request: `LinkRequest`.
+        mode: Of `link_pairs`, what is asked.
+        distances: Up to where each pair matters, device float64 (pair,); None where that is 0.
 
     Attributes:
-        pairs, pair_count, guard, wide: As of `BroadPhase`; a pair names a part first.
+        query: As given.
         active: Configurations that are posed, the room by default.
         configurations: Device float64 (room, width).
         chunk: `link_pairs.Chunk` of device arrays.
-        query: Query that the pairs are for.
+        demand: Pairs of a stage at most, and face pairs that waited, device int32 (2,).
     """
 
-    check_found = staticmethod(BroadPhase.check_found)
-    guard: LaunchGuard
-    wide = 0.0
-    pairs: wp.array
+    nearest: Any = None  # `answers.NearestParts`, where distances are asked
 
-    def __init__(self, query, request: LinkRequest, mode: int, capacity: int):
-        self.query, self.request, self.mode, self.batch = query, request, mode, query.batch
-        self.device = device = self.batch.device
-        self.active = request.room
-        room, frames, count = request.room, forward.Frames(), self.batch.object_count
-
-        def make(dtype, shape):
-            return wp.zeros(shape, dtype=dtype, device=device)
-
-        frames.rotation, frames.position = (make(t, (room, request.frame_count)) for t in (wp.mat33d, wp.vec3d))
-        self.frames, self.lower, self.upper = frames, make(wp.vec3, count), make(wp.vec3, count)
-        self.configurations = make(wp.float64, (room, request.width))
-        self.chunk = chunk = link_pairs.Chunk()
-        spread = (room, request.width) if mode == CHECK_MODES["within"] else (0, 0)
-        chunk.count, chunk.half, chunk.size = make(wp.int32, 1), make(wp.float64, spread), make(wp.float64, spread)
-        chunk.hit = make(wp.uint8, room)
-        chunk.near = make(wp.uint8, room if mode == CHECK_MODES["within"] else 0)
-        chunk.best = make(wp.float64, room if mode == CHECK_MODES["distance"] else 0)
-        self._no_reach, self._no_distance = make(wp.vec4d, 0), make(wp.float64, 0)
-        self.pair_count = make(wp.int32, 1)
-        self.pairs = wp.empty(capacity, dtype=wp.vec2i, device=device)
-        self.bvh = wp.Bvh(self.lower[: request.around], self.upper[: request.around]) if request.around else None
-
-    def make_room(self, pairs: wp.array) -> list:
-        """Return (owner, attribute, new array) of a list of pairs."""
-        return [(self, "pairs", pairs)]
+    def __init__(self, query, request: LinkRequest, mode: int, distances: str | None = None):
+        self.query, self.request, self.mode, self.active = query, request, mode, request.room
+        self.batch, self.device, self._distances, batch = query.batch, query.device, distances, query.batch
+        device, room = batch.device, request.room
+        rows = room, len(request.chain.lower)
+        self.frames = zeros_of(forward.Frames, room, len(request.chain.parent), device)
+        spread, within = (rows, room) if mode == link_pairs.ASK_WITHIN else ((0, 0), 0)
+        most = room if mode == link_pairs.ASK_DISTANCE else 0
+        self.chunk = link_pairs.Chunk()
+        sizes: dict[str, Any] = dict(count=1, half=spread, size=spread, hit=room, near=within, best=most)
+        for name, shape in sizes.items():
+            dtype = link_pairs.Chunk.vars[name].type.dtype
+            setattr(self.chunk, name, wp.zeros(shape, dtype=dtype, device=device))
+        self.configurations = wp.zeros(rows, dtype=wp.float64, device=device)
+        self.demand = wp.zeros(2, dtype=wp.int32, device=device)
+        self.boxes, around = link_pairs.LinkBoxes(), request.around
+        for name in ("lower", "upper"):
+            setattr(self.boxes, name, wp.zeros(batch.object_count, dtype=wp.vec3, device=device))
+        self.bvh = wp.Bvh(self.boxes.lower[:around], self.boxes.upper[:around]) if around else None
+        self.boxes.bvh = wp.uint64(0) if self.bvh is None else self.bvh.id
 
     def place(self):
         """Pose the parts of all configurations, and box all objects. Launches only."""
         request, device = self.request, self.device
+        parts, around = request.parts.frame, request.around
         inputs = [request.chain, self.configurations, self.frames]
         wp.launch(forward.forward_kernel, self.active, inputs, device=device)
-        inputs = [request.around, request.parts.frame, self.frames, self.batch.objects.pool]
-        wp.launch(forward.place_part_kernel, (self.active, request.part_count), inputs, device=device)
-        inputs = [self.batch.trees, self.guard.record(), 0.0, self._no_reach, self.lower, self.upper]
-        wp.launch(pose_box_kernel, request.around + self.active * request.part_count, inputs, device=device)
+        inputs = [around, parts, self.frames, self.batch.objects.pool]
+        wp.launch(forward.place_part_kernel, (self.active, len(parts)), inputs, device=device)
+        inputs = [self.batch.trees, self.query.guard.record(), 0.0, None, self.boxes.lower, self.boxes.upper]
+        wp.launch(pose_box_kernel, around + self.active * len(parts), inputs, device=device)
         if self.bvh is not None:
             self.bvh.rebuild()
         self.chunk.hit.zero_()
         self.chunk.near.zero_()
 
-    def launch(self, stage: tuple[int, int]):
-        """Find the pairs of a stage. Launches only."""
-        request, distances = self.request, self._no_distance
-        if self.mode == CHECK_MODES["within"]:
-            distances = self.query.within
-        elif self.mode == CHECK_MODES["distance"]:
-            distances = self.query.beyond
-        self.pair_count.zero_()
-        bvh = wp.uint64(0) if self.bvh is None else self.bvh.id
-        inputs = [self.mode, wp.vec2i(*stage), request.around, bvh, request.chain, request.parts, self.frames]
-        inputs += [self.lower, self.upper, self.chunk, self.pair_count, self.pairs, distances]
+    def launch(self):
+        """Launch all stages. Launches only."""
+        query = self.query
+        query.check_scene()
+        with query.guard.launching(self):
+            self._begin()
+            self.place()
+            for stage in self.request.stages:
+                query.pair_count.zero_()
+                self._find_pairs(stage)
+                query.search()
+                self._note([self.request.around, len(self.request.parts.frame), query.pair_batch])
+
+    def _find_pairs(self, stage):
+        request, query = self.request, self.query
+        distances = None if self._distances is None else query.distances_of(self._distances)
+        inputs = [self.mode, wp.vec2i(*stage), request.around, request.chain, request.parts, self.frames]
+        inputs += [self.boxes, self.chunk, query.pair_batch, distances]
         wp.launch(link_pairs.find_link_pair_kernel, self.active, inputs, device=self.device)
 
-
-class StagedQuery(Query):
-    """A query whose launch goes through the stages of `LinkPairs`; those that a configuration needs no more are empty.
-
-    Attributes:
-        links: `LinkPairs`.
-        demand: Pairs of a stage at most, and face pairs that waited, device int32 (2,).
-    """
-
-    links: LinkPairs
-
-    def _prepare(self, batch: Batch, request: LinkRequest, mode: str):
-        self.request, self.mode = request, CHECK_MODES[mode]
-        self.nearest: Any = None  # `answers.NearestParts`, where distances are asked
-        self.demand = wp.zeros(2, dtype=wp.int32, device=batch.device)
-
-    def _make_broad_phase(self, capacity, sorts):
-        self.links = LinkPairs(self, self.request, self.mode, capacity)
-        return self.links
-
-    def _fill_within(self):
-        """Distances are written where pairs are found."""
-
-    def _launch(self, between=None):
+    def _begin(self):
+        """Forget the answers of the last launch. Launches only."""
         self.demand.zero_()
-        self.links.place()
-        for stage in self.request.stages:
-            self.links.launch(stage)
-            self.prove_apart()
-            self.traverse()
-            self._note()
 
-    def _note(self):
+    def _note(self, found: list):
+        """Reduce the answers of a stage's pairs to those of configurations. Launches only."""
         raise NotImplementedError
-
-    def run_stages(self):
-        """Launch, and again with more room until nothing is lost. Waits for the device."""
-        while True:
-            self.launch()
-            pairs, uncertain = self.demand.numpy().tolist()
-            if not self.make_room_for(pairs, uncertain):
-                return
 
     def make_room_for(self, pairs: int, uncertain: int) -> bool:
         """Make room for a demand, and return whether there was too little."""
-        short = pairs > len(self.pairs), len(self.hits.uncertain) and uncertain > len(self.hits.uncertain)
-        if short[0]:
-            self._take_pairs(wp.empty(pairs + pairs // 4, dtype=wp.vec2i, device=self.device))
-        if short[1]:
-            self._resize_uncertain(2 * uncertain)
-        return bool(short[0] or short[1])
+        rooms, wanted = self.query.rooms, {}
+        if pairs > rooms.pairs:
+            wanted["pairs"] = pairs + pairs // 4
+        if 0 < rooms.uncertain < uncertain:
+            wanted["uncertain"] = 2 * uncertain
+        if wanted:
+            self.query.make_room(**wanted)
+        return bool(wanted)
 
 
-class LinkHits(StagedQuery):
+class LinkHits(LinkQuery):
     """Which configurations have parts that intersect; with proofs, also which have all proved apart by a reach."""
 
     def __init__(self, batch: Batch, request: LinkRequest, capacity: int, proves: bool):
-        self._prepare(batch, request, "within" if proves else "any")
-        self._no_near = wp.empty(0, dtype=wp.int32, device=batch.device)
-        super().__init__(batch, "any", capacity=Buffers(pairs=capacity), within=0.0 if proves else None)
+        query = Query(batch, "any", NO_PAIRS, Buffers(pairs=capacity), within=0.0 if proves else None)
+        mode = int(link_pairs.ASK_WITHIN if proves else link_pairs.ASK_ANY)
+        super().__init__(query, request, mode, "within" if proves else None)
 
-    def _note(self):
-        near = self._no_near if self.near is None else self.near.any_hit
-        links, request = self.links, self.request
-        inputs = [request.around, request.part_count, self.pair_batch, self.hits, near, links.chunk]
-        inputs.append(self.demand)
-        wp.launch(answers.note_hit_kernel, len(self.pairs), inputs, device=self.device)
+    def _note(self, found):
+        query = self.query
+        inputs = [*found, query.hits, None if query.near is None else query.near.any_hit, self.chunk, self.demand]
+        wp.launch(answers.note_hit_kernel, len(query.pairs), inputs, device=self.device)
 
 
-class LinkDistances(DistanceQuery, StagedQuery):
-    """How far apart the nearest parts of each configuration are, or a part and its surroundings, and where."""
+class LinkDistances(LinkQuery):
+    """How far apart the nearest parts of each configuration are, or a part and its surroundings, and where.
+
+    Attributes:
+        most: What is farther apart is infinitely far.
+    """
+
+    most = np.inf
 
     def __init__(self, batch: Batch, request: LinkRequest, capacity: int):
-        self._prepare(batch, request, "distance")
-        self.most = np.inf
-        self.nearest = nearest = answers.NearestParts()
-        for name, dtype in (
-            ("winner", wp.int64),
-            ("distance", wp.float64),
-            ("points", answers.two_points),
-            ("faces", wp.vec2i),
-            ("pair", wp.vec2i),
-        ):
-            setattr(nearest, name, wp.empty(request.room, dtype=dtype, device=batch.device))
-        super().__init__(batch, capacity=Buffers(pairs=capacity))
+        self.nearest = zeros_of(answers.NearestParts, request.room, 0, batch.device)
+        query = DistanceQuery(batch, NO_PAIRS, Buffers(pairs=capacity))
+        super().__init__(query, request, int(link_pairs.ASK_DISTANCE), "beyond")
 
-    @property
-    def beyond(self) -> wp.array:
-        """Distance that ends the search of each pair."""
-        return self._found.beyond
+    def _begin(self):
+        super()._begin()
+        self.chunk.best.fill_(self.most)
+        self.nearest.distance.fill_(np.inf)
+        self.nearest.points.fill_(np.nan)
+        self.nearest.faces.fill_(wp.vec2i(-1, -1))
+        self.nearest.pair.fill_(wp.vec2i(-1, -1))
 
-    def _launch(self, between=None):
-        nearest: Any = self.nearest
-        self.links.chunk.best.fill_(self.most)
-        nearest.distance.fill_(np.inf)
-        nearest.points.fill_(np.nan)
-        nearest.faces.fill_(wp.vec2i(-1, -1))
-        nearest.pair.fill_(wp.vec2i(-1, -1))
-        super()._launch(between)
-
-    def _note(self):
-        links, request = self.links, self.request
-        nearest: Any = self.nearest
-        nearest.winner.fill_(int(answers.NO_PAIR))
-        given = [request.around, request.part_count, self.pair_batch]
+    def _note(self, found):
+        query = self.query
+        self.nearest.winner.fill_(int(answers.NO_PAIR))
         for kernel, inputs in (
-            (answers.note_distance_kernel, [self.hits, self.distances, links.chunk, self.demand]),
-            (answers.find_winner_kernel, [self.distances, links.chunk, nearest]),
-            (answers.write_nearest_kernel, [self.distances, nearest, links.chunk]),
+            (answers.note_distance_kernel, [query.hits, query.distances, self.chunk, self.demand]),
+            (answers.find_winner_kernel, [query.distances, self.chunk, self.nearest]),
+            (answers.write_nearest_kernel, [query.distances, self.nearest, self.chunk]),
         ):
-            wp.launch(kernel, len(self.pairs), [*given, *inputs], device=self.device)
-        self.forget()
+            wp.launch(kernel, len(query.pairs), [*found, *inputs], device=self.device)
+        query.forget()

@@ -2,12 +2,11 @@
 
 import math
 import re
-import warnings
 from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line
+from warp_abtree.checks.arguments import first_line, warn_caller
 from warp_abtree.interop.robot.description import (
     Description,
     Part,
@@ -123,14 +122,12 @@ def _warn_of_closures(mujoco, model, path):
     for t in [] if _is_off(mujoco, model, "LIMIT", "CONSTRAINT") else np.flatnonzero(model.tendon_limited).tolist():
         found.append(f"the limits of tendon {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TENDON, t) or t!r}")
     if _is_off(mujoco, model, "CONTACT", "CONSTRAINT"):
-        message = f"{path}: it disables contacts; Robot.check tests its pairs all the same"
-        warnings.warn(message, RuntimeWarning, stacklevel=4)
+        warn_caller(f"{path}: it disables contacts; Robot.check tests its pairs all the same")
     if found:
-        message = f"{path}: not enforced: {', '.join(found)}; links stand where their joints alone put them"
-        warnings.warn(message, RuntimeWarning, stacklevel=4)
+        warn_caller(f"{path}: not enforced: {', '.join(found)}; links stand where their joints alone put them")
 
 
-def _pose(position, quaternion) -> np.ndarray:
+def _pose(position, quaternion=(1.0, 0.0, 0.0, 0.0)) -> np.ndarray:
     """Return the transform of a position and a quaternion w x y z."""
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     matrix = np.eye(4)
@@ -150,7 +147,7 @@ def _add_body(mujoco, model, b, description, names, values, path) -> int:
     anchor = np.zeros(3)
     first = int(model.body_jntadr[b])
     for j in range(first, first + int(model.body_jntnum[b])):
-        origin = origin @ _shift(model.jnt_pos[j] - anchor)
+        origin = origin @ _pose(model.jnt_pos[j] - anchor)
         anchor = model.jnt_pos[j]
         joint, scale, offset = values[j]
         start = float(model.qpos0[model.jnt_qposadr[j]])
@@ -160,14 +157,8 @@ def _add_body(mujoco, model, b, description, names, values, path) -> int:
         description.frames.append(frame)
         parent, origin = len(description.frames) - 1, np.eye(4)
     if anchor.any() or not model.body_jntnum[b]:
-        description.frames.append(RobotFrame(parent, origin @ _shift(-anchor)))
+        description.frames.append(RobotFrame(parent, origin @ _pose(-anchor)))
     return len(description.frames) - 1
-
-
-def _shift(by) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, 3] = by
-    return matrix
 
 
 def _add_all_parts(mujoco, model, description, geometry, where):
@@ -227,8 +218,7 @@ def _shape(mujoco, model, g, where):
 def _recut(model, m, vertices, faces, where):
     """Return the faces of a mesh, those of an OBJ file with polygons cut anew: MuJoCo's may fold over.
 
-    Raises:
-        RobotError: MuJoCo has other vertices than the file.
+    Raises RobotError where MuJoCo has other vertices than the file.
     """
     start = int(model.mesh_pathadr[m])
     path = Path(model.paths[start : model.paths.index(b"\0", start)].decode() if start >= 0 else "")

@@ -4,7 +4,6 @@ A configuration holds a value of each of `joint_names` [rad, or the file's unit 
 file: poses of links are in that of its root, and what surrounds the robot is placed in it.
 """
 
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from warp_abtree.checks.arguments import (
     flag,
     is_device_array,
     to_numpy,
+    warn_caller,
     whole_number,
     wrap_array,
 )
@@ -25,7 +25,7 @@ from warp_abtree.interop.robot.surroundings import make_surroundings
 from warp_abtree.interop.robot.urdf import apply_srdf, read_urdf
 from warp_abtree.kernels.robot import forward
 from warp_abtree.model.model import Model
-from warp_abtree.query.distance import check_beyond
+from warp_abtree.query.stages.distance import check_beyond
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.batch import check_pairs
 
@@ -135,11 +135,7 @@ class Robot:
         for k in map(self.link_names.index, names):
             fixed = [k] if k in self.model_link else np.flatnonzero(body == body[k]).tolist()
             if not np.isin(fixed, self.model_link).any():
-                warnings.warn(
-                    f"mounted: no mesh is fixed to the link {self.link_names[k]!r}: naming it changes nothing",
-                    RuntimeWarning,
-                    stacklevel=4,
-                )
+                warn_caller(f"mounted: no mesh is fixed to the link {self.link_names[k]!r}: naming it changes nothing")
             found |= dict.fromkeys(fixed)
         return list(found)
 
@@ -293,7 +289,7 @@ class Robot:
         rooms = ROOMS["cpu" if self.device.is_cpu else "cuda"]
         room = next((room for room in rooms if room >= count), rooms[-1])
         query = self._kept.pop((key, output, room), None)
-        if query is None or not query.is_of(around):
+        if query is None or not query.robots.is_of(around):
             query = RobotQuery(self, around, output, room)
         self._kept[key, output, room] = query
         for old in list(self._kept)[:-KEPT]:

@@ -5,10 +5,10 @@ import warp as wp
 
 from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.model.model import Model
-from warp_abtree.scene.poses import check_poses
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.arrays import ObjectArrays
 from warp_abtree.state.batch import Batch
+from warp_abtree.state.poses import check_poses
 
 STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -16,12 +16,8 @@ STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 def make_surroundings(world, device) -> tuple[Scene | None, tuple]:
     """Return what surrounds a robot as a scene of a device, None where there is nothing, and what tells it from others.
 
-    Args:
-        world: `Scene`, `Model`, a list of models and pairs (model, pose), or None.
-
-    Raises:
-        TypeError: It is none of these.
-        ValueError: A scene of another device or of several worlds, a bad pose.
+    `world` as for `Robot.check`: raises TypeError for anything else, ValueError for a scene of another device or of
+    several worlds, or a bad pose.
     """
     if isinstance(world, Scene):
         if world.device != device:
@@ -45,18 +41,12 @@ def make_surroundings(world, device) -> tuple[Scene | None, tuple]:
 
 
 class RobotBatch:
-    """The batch of what surrounds a robot, at its LODs, and of the parts of a number of robots.
-
-    Args:
-        around: `Scene`, or None.
-        models: Of the parts.
-        room: Robots.
+    """The batch of what surrounds a robot, a `Scene` at its LODs or None, and of the parts of a number of robots.
 
     Attributes:
         batch: `Batch`; objects of the surroundings come first.
         count: Objects of the surroundings.
-        meets: Whether the bits of each of these let it meet the robot, whose group is 1, with every bit in its mask,
-            bool (count,).
+        meets: Whether the bits of each of these let it meet the robot, whose group is 1, with every bit in its mask.
     """
 
     def __init__(self, around: Scene | None, models: list[Model], room: int, device):
@@ -86,11 +76,7 @@ class RobotBatch:
         return self._batch is around.batch() and np.array_equal(self._lods, around.lods)
 
     def take_poses(self):
-        """Copy the poses of what surrounds the robot. Launches only.
-
-        Raises:
-            RuntimeError: Objects were added to its scene since.
-        """
+        """Copy the poses of what surrounds the robot; raise RuntimeError if objects were added to it. Launches only."""
         if self._batch is not None:
             self._batch.check("robot query")
             source, target = self._batch.objects.pool, self.batch.objects.pool

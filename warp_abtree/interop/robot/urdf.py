@@ -4,14 +4,13 @@ import gzip
 import math
 import os
 import re
-import warnings
 from pathlib import Path
 from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line
+from warp_abtree.checks.arguments import first_line, warn_caller
 from warp_abtree.interop.robot.description import (
     Description,
     Part,
@@ -56,8 +55,7 @@ def read_urdf(path: Path, geometry: str) -> Description:
         _check_joint(joint, joints, names, path)
     roots = [name for name in names if name not in joints]
     if len(roots) > 1:
-        message = f"{path}: {', '.join(map(repr, roots[1:]))} hang on no joint, and are placed where {roots[0]!r} is"
-        warnings.warn(message, RuntimeWarning, stacklevel=3)
+        warn_caller(f"{path}: {', '.join(map(repr, roots[1:]))} hang on no joint, and are placed where {roots[0]!r} is")
     for joint in robot.joints:  # in the file's order, as configurations are
         if joint.type != "fixed" and joint.mimic is None:
             description.joints[joint.name] = _limits(joint, path)
@@ -151,8 +149,7 @@ def _add_link(name, description, joints, values, path):
 def _check_elements(path):
     """Refuse what yourdfpy mends or leaves out in silence, and warn of joints that it does not read.
 
-    Raises:
-        RobotError: A line that is no XML, another root, a geometry of other than one shape, a mesh of other than one.
+    Refused are lines that are no XML, another root, geometries of other than one shape, meshes of other than one.
     """
     from lxml import etree  # of yourdfpy
 
@@ -165,12 +162,11 @@ def _check_elements(path):
     for odd in root.xpath("//geometry[count(*) != 1] | link/*[self::collision or self::visual][count(geometry) != 1]"):
         one = "shape" if odd.tag == "geometry" else "geometry"
         raise RobotError(f"{path}: not read as URDF (line {odd.sourceline}: a {odd.tag} has one {one})")
-    _warn_of_unread([e.tag for e in root.iter() if "xacro" in str(e.tag)], path, 5)
+    _warn_of_unread([e.tag for e in root.iter() if "xacro" in str(e.tag)], path)
     found = root.xpath("//*[local-name()='gazebo']//joint | //*[contains(name(), 'loop_joint')]")
     if found:
         names = ", ".join(repr(joint.get("name")) for joint in found)
-        message = f"{path}: not enforced: joints {names} of a <gazebo> or loop_joint element"
-        warnings.warn(message, RuntimeWarning, stacklevel=4)
+        warn_caller(f"{path}: not enforced: joints {names} of a <gazebo> or loop_joint element")
 
 
 def _check_root(root, what, path):
@@ -179,19 +175,15 @@ def _check_root(root, what, path):
         raise RobotError(f"{path}: not read as {what} ({told})")
 
 
-def _warn_of_unread(tags, path, level):
+def _warn_of_unread(tags, path):
     if tags:
         names = ", ".join(dict.fromkeys(re.sub(r"^\{.*\}", "xacro:" if "xacro" in tag else "", tag) for tag in tags))
         told = "; xacro expands a file" if "xacro" in names else ""
-        warnings.warn(f"{path}: not read: elements {names}{told}", RuntimeWarning, stacklevel=level)
+        warn_caller(f"{path}: not read: elements {names}{told}")
 
 
 def _find_file(name, where, path) -> Path:
-    """Return the file of a mesh, sought beside the robot's file and above: of a package with its folder, then without.
-
-    Raises:
-        RobotError: There is none.
-    """
+    """Find the file of a mesh beside the robot's file and above it: of a package with its folder and without."""
     given = (name or "").strip().replace("\\", "/")
     tails = [re.sub("^package:/+|^[a-z]+://", "", given)]
     if given.startswith(("package:", "model:")):
@@ -233,11 +225,7 @@ def _load_shape(geometry, where, path):
 
 
 def _unit_of(file: Path, where) -> float:
-    """Return the unit of a Collada file [m], 1 for files of other formats.
-
-    Raises:
-        RobotError: It is not positive.
-    """
+    """Return the unit of a Collada file [m], 1 for files of other formats; raise RobotError if it is not positive."""
     _, kind, zipped = split_file_name(file)
     if kind == "zae":
         raise RobotError(f"{where}: {file.name} is an archive; unpack the .dae of it")
@@ -265,17 +253,15 @@ def _sizes(given, count, where) -> np.ndarray:
 
 def apply_srdf(description: Description, path: Path, strict: bool):
     """Exclude and demand the pairs that an SRDF file does, as MoveIt: what it disables goes over what it enables, and
-    this over the links that it disables by default, whatever their order.
-
-    Raises:
-        RobotError: It is unreadable, or names a link that the robot has not and `strict` holds, which otherwise warns.
+    this over the links that it disables by default, whatever their order. A link that the robot has not is refused if
+    `strict`, else warned of.
     """
     try:
         root = ElementTree.parse(path).getroot()
     except ElementTree.ParseError as error:
         raise RobotError(f"{path}: not read as SRDF ({first_line(error)})") from None
     _check_root(root, "SRDF", path)
-    _warn_of_unread([entry.tag for entry in root if entry.tag not in SRDF_TAGS], path, 4)
+    _warn_of_unread([entry.tag for entry in root if entry.tag not in SRDF_TAGS], path)
     links, unknown = list(description.links), {}
 
     def read(tag, *attributes):
@@ -304,5 +290,4 @@ def apply_srdf(description: Description, path: Path, strict: bool):
             elif pair in enabled:
                 description.demanded.add(frozenset((i, j)))
     if unknown:
-        message = f"{path}: what is said of {', '.join(map(repr, unknown))} is left out: no links of the robot"
-        warnings.warn(message, RuntimeWarning, stacklevel=3)
+        warn_caller(f"{path}: what is said of {', '.join(map(repr, unknown))} is left out: no links of the robot")

@@ -15,8 +15,7 @@ COLLADA_LOOKS = ("effect", "material", "image", "surface", "sampler", "texture",
 def read_collada(data: bytes, where: str, remarks: Remarks):
     """Return a Collada file as a trimesh.Scene, in the file's units and axes.
 
-    Raises:
-        MeshError: pycollada is missing, the file is damaged, or a polygon has holes.
+    Raises MeshError where pycollada is missing, the file is damaged, or a polygon has holes.
     """
     import trimesh
 

@@ -1,10 +1,10 @@
 """Surfaces that readers of mesh files return, their remarks, and the error that they raise."""
 
-import inspect
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
+
+from warp_abtree.checks.arguments import warn_caller
 
 NAMED = 4  # things that a warning lists by name
 
@@ -35,28 +35,18 @@ class Remarks:
 
     def warn(self, where):
         """Warn of them, if any, at the line that called the library."""
-        frame, level = inspect.currentframe(), 1
-        while frame is not None and frame.f_globals.get("__name__", "").startswith("warp_abtree."):
-            frame, level = frame.f_back, level + 1
         if str(self):
-            warnings.warn(f"{where}: {self}", stacklevel=level)
+            warn_caller(f"{where}: {self}", UserWarning)
 
 
 @dataclass(frozen=True, eq=False)
 class FileSurface:
-    """Triangles over one list of vertices, in the order of their file.
+    """Triangles over one list of vertices, in the order of their file."""
 
-    Attributes:
-        vertices: Positions [file's units], float64 (v, 3).
-        faces: Corners (n_f, 3), integers.
-        names: Of the parts that the file makes of its faces, None for one without a name.
-        parts: Part of each face (n_f,); None where there is one part.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    names: tuple[str | None, ...] = (None,)
-    parts: np.ndarray | None = None
+    vertices: np.ndarray  # positions [file's units], float64 (v, 3)
+    faces: np.ndarray  # corners (n_f, 3), integers
+    names: tuple[str | None, ...] = (None,)  # of the parts that the file makes of its faces, None without a name
+    parts: np.ndarray | None = None  # part of each face (n_f,); None where there is one part
 
     def as_scene(self, name: str):
         """Return a trimesh.Scene with a node of each part that has faces, those without a name called by one."""

@@ -23,13 +23,9 @@ KINDS = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
 
 
 def read_gltf(data: bytes, where: str, resolver, remarks: Remarks):
-    """Return a glTF or GLB file as a trimesh.Scene.
+    """Return a glTF or GLB file as a trimesh.Scene; trimesh's resolver finds files that it refers to.
 
-    Args:
-        resolver: Of trimesh, for files that it refers to.
-
-    Raises:
-        MeshError: It is damaged, refers to a file that is missing, or requires an extension that is not read.
+    Raises MeshError where it is damaged, such a file is missing, or it requires an extension that is not read.
     """
     try:
         text, binary = _split_binary(data, where) if data[:4] == b"glTF" else (data, None)

@@ -13,10 +13,7 @@ LEFT_OUT |= {b"bsp": "free-form surfaces", b"bzp": "free-form surfaces"}
 
 
 def _parse_plain_obj(data) -> FileSurface | None:
-    """Return what an OBJ file holds where each `v` has three numbers and each `f` three plain indices.
-
-    None for any other file, and for one that has mistakes.
-    """
+    """Return an OBJ file in which each `v` has three numbers and each `f` three plain indices, None of any other."""
     lines = data.splitlines()
     starts = {line[:2] for line in lines}
     if any(mark in data for mark in (b"\\", b"\t", b"\v", b"\f")) or not starts <= PLAIN_STARTS:

@@ -10,8 +10,7 @@ from warp_abtree.model.files.found import MeshError
 def triangulate(vertices, counts, corners, where):
     """Cut polygons into triangles, in place: polygon p gives counts[p] - 2 of them.
 
-    Raises:
-        MeshError: A polygon has fewer than three corners, or refers to no vertex.
+    Raises MeshError for a polygon with fewer than three corners, or that refers to no vertex.
     """
     if not len(vertices):
         raise MeshError(f"{where}: no vertices")

@@ -38,8 +38,7 @@ def split_file_name(path: Path) -> tuple[str, str, bool]:
 def read_file(path: Path, remarks: Remarks):
     """Return a `FileSurface` of a file with one list of vertices; of any other format a trimesh.Scene.
 
-    Raises:
-        MeshError: The file is missing, damaged, of an unknown format, or holds what cannot be read.
+    Raises MeshError for a file that is missing, damaged, of an unknown format, or holds what cannot be read.
     """
     if path.is_dir():
         raise MeshError(f"{path}: is a folder, not a mesh file")

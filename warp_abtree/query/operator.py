@@ -1,0 +1,395 @@
+"""Operator of queries about object pairs: its pairs and their buffers, replaced whole or not at all, and its stages.
+
+A launch runs the broad phase, unless pairs are given, then what each stage searches, in their order, and then what each
+stage reports of the hits. Where a buffer was too small, `run` makes room and searches again before anything is
+reported.
+"""
+
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import check_device
+from warp_abtree.checks.device_memory import DeviceMemory
+from warp_abtree.checks.kernel_loading import loading
+from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels.base.poses import PairBatch, PairPose
+from warp_abtree.kernels.search.make_slabs import make_slab_kernel
+from warp_abtree.query.broad_phase import BroadPhase, PosedBoxes
+from warp_abtree.query.commands import Commands
+from warp_abtree.query.readout import Readout, readout_kernels
+from warp_abtree.query.request import LIST_MAX, check_capacity, check_pair_room
+from warp_abtree.query.result import Found, Result
+from warp_abtree.query.stage import Array, PairDistance, Rooms, Stage
+from warp_abtree.state.batch import Batch
+from warp_abtree.state.generation import LaunchGuard
+
+# Face pairs that the float32 stage leaves uncertain: about one in a hundred. The list grows as needed.
+UNCERTAIN_ROOM = 65536
+
+
+def operator_kernels(device, stages, output: str) -> list:
+    """Return the kernels of the first launch of an operator with these stages, as `loading` takes them."""
+    regime = current_regime()
+    found = [kernel for stage in stages for kernel in stage.kernels(device)]
+    if regime.uses_warps(device) and regime.slabs:
+        found.append((make_slab_kernel, 256))
+    return [*found, *readout_kernels(device, output)]
+
+
+class Operator(DeviceMemory):
+    """Base of operators: allocates once, launches many times.
+
+    Args:
+        scene: `Scene` or `Batch`.
+        stages: In the order in which they are launched; the first that has `hits` is what the others go on from.
+        pairs, capacity, sort_pairs: As for `Query`.
+        output: What `Query` calls so, "faces" where hits are listed.
+
+    Attributes:
+        batch, device, regime: What it is about, and where and how it launches.
+        pair_batch: `PairBatch` of the pairs queried.
+        hits: Device arrays of the last launch, `kernels.intersect.face_pairs.Hits`.
+        counts: Counters of `hits`, device int64; rows: count, then `COUNTERS`.
+        traversal: `Traversal` of the hits, which stages share.
+        given: Pairs on the host, int32 (p, 2), unless the broad phase finds them.
+        commands, guard: Its recorded launches, and what became of them.
+        growth: Room that `run` makes, over the demand.
+    """
+
+    growth = 1
+    broad_phase: Any = None
+    near: Any = None
+    hits: Any
+    counts: wp.array
+    traversal: Any
+    given: Any = None
+
+    def __init__(self, scene, stages: list[Stage], pairs=None, capacity=None, output="any", sort_pairs=False):
+        check_device(scene.device, f"making a {type(self).__name__}")
+        room = check_capacity(capacity)
+        self.device, self.regime, self.stages, self.output = scene.device, current_regime(), stages, output
+        with loading(self.device, operator_kernels(self.device, stages, output)):
+            self.batch = batch = scene if isinstance(scene, Batch) else scene.batch()
+            if self.uses_warps() and self.regime.slabs:
+                batch.models.make_slabs()
+        if pairs is not None:
+            self.given = batch.check_pairs(pairs)
+        count = None if pairs is None else len(self.given)
+        self._distances: dict[str, PairDistance] = {}
+        for stage in stages:
+            if stage.distance is not None:
+                self._distances[stage.distance.name] = stage.distance
+        self._torn = False
+        self.commands = Commands()
+        self.guard = LaunchGuard(
+            self.device, batch.states.generation, batch.filter_generation if pairs is None else None
+        )
+        self.pair_batch = asked = PairBatch()
+        asked.launched = self.guard.launched
+        for stage in stages:
+            stage.attach(self)
+        for distance in self._distances.values():
+            if distance.value is not None:
+                distance.value = distance.check(None, count)
+        if pairs is None:
+            self._excluded_count = len(batch.excluded)
+            boxes = PosedBoxes(batch)
+            for stage in stages:
+                boxes = stage.boxes(boxes)
+            self.broad_phase = BroadPhase(batch, room.pairs, sort_pairs, boxes, self.guard)
+            asked.count, asked.pairs = self.broad_phase.pair_count, self.broad_phase.pairs
+            places = len(asked.pairs)
+        else:
+            asked.count = wp.zeros(1, dtype=wp.int32, device=self.device)
+            places = max(room.pairs or 0, len(self.given))
+            check_pair_room(places)
+        self.readout = Readout(self)
+        uncertain = (room.uncertain or UNCERTAIN_ROOM) if self.uses_warps() else 0
+        hits = (room.hits or max(1024, 16 * places)) if output == "faces" else 0
+        self.rooms = Rooms()
+        self.make_room(places, hits, uncertain)
+        if pairs is not None:
+            self.replace_pairs(self.given)
+
+    @property
+    def pairs(self) -> wp.array:
+        """Return the pairs queried, device vec2i, as many as there is room for."""
+        return self.pair_batch.pairs
+
+    @property
+    def pair_count(self) -> wp.array:
+        """Return how many pairs there are, device int32 (1,)."""
+        return self.pair_batch.count
+
+    @property
+    def pair_poses(self) -> wp.array:
+        """Return the pose of each pair, device `PairPose`."""
+        return self.pair_batch.poses
+
+    def uses_warps(self) -> bool:
+        """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
+        return self.regime.uses_warps(self.device)
+
+    def _asked_arrays(self, rooms: Rooms) -> list[Array]:
+        own = [Array(self.pair_batch, "poses", PairPose, rooms.pairs)]
+        if self.broad_phase is None:
+            own.append(Array(self.pair_batch, "pairs", wp.vec2i, rooms.pairs))
+        for stage in self.stages:
+            own += [*stage.arrays(rooms), *stage.state_arrays()]
+        return own
+
+    def _make(self, rooms: Rooms) -> list:
+        """Return (owner, attribute, new array) of all that other rooms take, before anything is replaced."""
+        check_pair_room(rooms.pairs)
+        for stage in self.stages:
+            stage.prepare(rooms)
+        made = [
+            (asked.owner, asked.name, asked.make(self.device))
+            for asked in self._asked_arrays(rooms)
+            if not asked.is_in_place()
+        ]
+        if self.broad_phase is not None and rooms.pairs != len(self.broad_phase.pairs):
+            found = self.broad_phase.make_arrays(rooms.pairs)
+            pairs = next(array for _, name, array in found if name == "pairs")
+            made += [*found, (self.pair_batch, "pairs", pairs)]
+        return made
+
+    def make_room(self, pairs: int | None = None, hits: int | None = None, uncertain: int | None = None):
+        """Make room for other numbers of entries, None for those of before: for all, or nothing changes.
+
+        Raises:
+            CapacityError: More than there can be room for.
+        """
+        asked = zip((pairs, hits, uncertain), self.rooms, strict=True)
+        rooms = Rooms(*(now if wanted is None else wanted for wanted, now in asked))
+        made = self._make(rooms)
+        with self.changing():
+            self._replace(made, rooms)
+            if self.broad_phase is not None:
+                self._fill_distances()
+
+    def resize(self, capacity: int):
+        """Make room for a number of intersecting face pairs."""
+        self.make_room(hits=capacity)
+
+    def _replace(self, made: list, rooms: Rooms):
+        """Put new arrays, (owner, attribute, array), in the place of old ones."""
+        self.guard.buffers.advance()
+        with self.changing():
+            for owner, name, array in made:
+                setattr(owner, name, array)
+            self.rooms = rooms
+            for stage in self.stages:
+                stage.link()
+            self.readout.link()
+
+    @contextmanager
+    def changing(self):
+        """Refuse the operator for good where a change of what belongs together is interrupted."""
+        before, self._torn = self._torn, True
+        yield
+        self._torn = before
+
+    def check_whole(self):
+        """Raise RuntimeError where a change of buffers was interrupted."""
+        if self._torn:
+            raise RuntimeError("this query was interrupted while its buffers changed; make a new one")
+
+    def _fill_distances(self):
+        for distance in self._distances.values():
+            distance.fill()
+
+    def distances_of(self, name: str) -> wp.array:
+        """Return the distances of pairs of a name, such as "within", device float64 (pair capacity,)."""
+        return self._distances[name].rows
+
+    def ask_pairs(self, pairs, **distances):
+        """Query other pairs from now on, in the room there is if they fit; distances of None stay.
+
+        Raises:
+            ValueError: Bad pairs or distances, an operator that runs the broad phase, or distances for one made
+                without.
+        """
+        if self.broad_phase is not None:
+            raise ValueError("this query takes its pairs from the broad phase")
+        check_device(self.device, "giving a query other pairs")
+        self.check_whole()
+        pairs = self.batch.check_pairs(pairs)
+        for name, value in distances.items():
+            if value is not None and name not in self._distances:
+                raise ValueError(f"this query was made without {name}")
+        checked = {name: taken.check(distances.get(name), len(pairs)) for name, taken in self._distances.items()}
+        self.replace_pairs(pairs, **checked)
+
+    def replace_pairs(self, pairs: np.ndarray, **distances):
+        """Do what `ask_pairs` does, with pairs and distances that are checked; those left out stay."""
+        self.check_whole()
+        # What may fail for lack of memory comes before anything that changes the query.
+        rooms = Rooms(max(len(pairs), self.rooms.pairs), *self.rooms[1:])
+        made = self._make(rooms) if rooms != self.rooms else []
+        with self.changing():
+            if made:
+                self._replace(made, rooms)
+            self.guard.forget()
+            self.readout.write_pairs(pairs)
+            self.given = pairs
+            for name, value in distances.items():
+                self._distances[name].value = value
+            self._fill_distances()
+
+    def is_asked(self, pairs: np.ndarray, **distances) -> bool:
+        """Return whether pairs and distances, checked, None without, are those in place."""
+        same = len(pairs) == len(self.given) and pairs.tobytes() == self.given.tobytes()
+        for name, value in distances.items():
+            now: Any = None if value is None else self._distances[name].value
+            same = same and (value is now or np.array_equal(value, now))
+        return same
+
+    def launch(self, between=None):
+        """Run broad phase (unless pairs were given) and narrow phase. Launches only.
+
+        Args:
+            between: Called between the two, as to time them.
+
+        Raises:
+            RuntimeError: The scene's objects changed since the query was made, or its filter where the broad phase
+                runs; or a change of the query's buffers was interrupted.
+        """
+        self.check_scene()
+        with self.guard.launching(self):
+            self.launch_search(between)
+            self.report()
+
+    def launch_search(self, between=None):
+        """Launch the broad phase and what the stages search."""
+        if self.broad_phase is not None:
+            self.broad_phase.launch()
+        if between is not None:
+            between()
+        self.search()
+
+    def search(self):
+        """Search the pairs in place. Launches only, after making room for tree states that are new."""
+        if not len(self.pairs):
+            return
+        if not self.device.is_capturing and not all(
+            asked.is_in_place() for stage in self.stages for asked in stage.state_arrays()
+        ):
+            self.make_room()
+        for stage in self.stages:
+            stage.search()
+
+    def report(self, count: int | None = None):
+        """Compute further outputs of the hits, of which there are so many; None: all that have room. Launches only."""
+        if len(self.pairs):
+            for stage in self.stages:
+                stage.report(count)
+
+    def check_scene(self):
+        """Raise RuntimeError where the scene is no longer that of the operator, or a graph is being captured."""
+        check_device(self.device)
+        self.check_whole()
+        self.batch.check("query")
+        if self.broad_phase is not None and len(self.batch.excluded) > self._excluded_count:
+            raise RuntimeError("pairs were filtered out of the scene since this query was made; make a new one")
+
+    def find_launches(self, name: str, make, *given) -> list:
+        """Return the launches that `make` lists, as callables, recorded while arrays and what is given stand."""
+        # The generations are brought up to date first: kernels read the record.
+        return self.commands.find_callables(name, (*self.guard.given(), *given), self.device, make)
+
+    def launch_all(self, name: str, make):
+        """Launch what `make` lists, in this order, see `Commands.find`; into a graph, too."""
+        for launch in self.find_launches(name, make):
+            launch()
+
+    def launch_kernel(self, kernel, dim: int, inputs: list, block_dim=256, given: tuple = ()):
+        """Launch a kernel, recorded until the arrays are replaced, or dim or what else is given changes."""
+
+        def make(launch):
+            return [launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_dim)]
+
+        for launch in self.find_launches(kernel.key, make, dim, *given):
+            launch()
+
+    def launch_warps(self, kernel, count: int, inputs: list):
+        """Launch a kernel with a warp for each of so many items, on the CPU a thread."""
+        self.launch_kernel(kernel, count * self.lanes, inputs, 32)
+
+    @property
+    def lanes(self) -> int:
+        """Return the threads of a warp; 1 on the CPU."""
+        return 32 if self.device.is_cuda else 1
+
+    def result(self, device: bool = False) -> Result:
+        """Return the results of the last launch, sorted. Waits for the device.
+
+        Args:
+            device: Whether the arrays stay on the device, as Warp arrays that no later launch changes.
+
+        Raises:
+            RuntimeError: There are none: nothing was launched, a launch was interrupted, or it was the replay of a
+                graph whose arrays were replaced.
+        """
+        return self.readout.read(device)
+
+    def run(self, device: bool = False) -> Result:
+        """Launch, grow buffers that were too small, and return the whole result, as `result`. Waits for the device."""
+        read = self.readout
+        first = partial(read.launch_and_bring, self.launch_search) if read.repeats_calls(device) else None
+        result = read.make_result(self._grow(partial(read.read_pairs, device), first=first), device)
+        result.check()
+        return result
+
+    def grow(self, between=None):
+        """Launch, and again with more room until nothing is lost. Waits for the device.
+
+        Args:
+            between: As for `launch`, which calls it once.
+
+        Raises:
+            CapacityError: More pairs or hits than there can be room for.
+            RuntimeError: As `launch`; or a graph is being captured.
+        """
+        self._grow(self._read_demand, between)
+
+    def _read_demand(self) -> Found:
+        return Found(self.readout.read_totals())
+
+    def _grow(self, read, between=None, first=None) -> Found:
+        """Launch as `grow` and return what `read` finds of the last launch; `first` does both the first time."""
+        check_device(self.device, f"{type(self).__name__}.run (launch can)")
+        self.check_scene()
+        with self.guard.launching(self):
+            if first is None:
+                self.launch_search(between)
+            found = read() if first is None else first()
+            if found.totals.pairs > len(self.pairs):
+                self.make_room(pairs=self.growth * found.totals.pairs)
+                self.launch_search()
+                found = read()
+            found = self._grow_uncertain(read, found)
+            if found.totals.hits > len(self.hits.face):
+                self.resize(self.growth * found.totals.hits)
+                self.search()
+                found = read()
+            self.report(found.totals.hits)
+        return found
+
+    def grow_uncertain(self):
+        """Make room for the face pairs that wait, as far as there can be, and launch again until all find it."""
+        first = self._read_demand()
+        if self._grow_uncertain(self._read_demand, first) is not first:
+            self.report()
+
+    def _grow_uncertain(self, read, found: Found) -> Found:
+        # How many wait varies for `any`, where the first hit of a pair ends its traversal.
+        while 0 < len(self.hits.uncertain) < min(LIST_MAX, found.totals.uncertain):
+            self.make_room(uncertain=min(2 * found.totals.uncertain, LIST_MAX))
+            self.search()
+            found = read()
+        return found

@@ -1,0 +1,137 @@
+"""Stage of an operator: what it allocates, loads, launches and reads; and the distances of pairs that it is given."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.query.request import check_within
+
+
+class Rooms(NamedTuple):
+    """Entries that the arrays of an operator have room for."""
+
+    pairs: int = 0
+    hits: int = 0  # face pairs that are listed
+    uncertain: int = 0  # face pairs between float32 and the later passes
+
+
+class Array(NamedTuple):
+    """Device array that a stage asks for: the attribute that holds it, type and shape, and what is in it at first."""
+
+    owner: Any  # a stage, or a Warp struct of its own
+    name: str
+    dtype: Any
+    shape: Any
+    fill: Any = None  # a value, or what is called with the new array; None: whatever was there
+
+    def is_in_place(self) -> bool:
+        """Return whether the attribute holds an array of this shape."""
+        array, shape = getattr(self.owner, self.name, None), self.shape
+        return array is not None and array.shape == (shape if isinstance(shape, tuple) else (shape,))
+
+    def make(self, device) -> wp.array:
+        """Return a new array."""
+        if self.fill is None or callable(self.fill):
+            array = wp.empty(self.shape, dtype=self.dtype, device=device)
+            if callable(self.fill):
+                self.fill(array)
+            return array
+        if isinstance(self.fill, int) and self.fill == 0:
+            return wp.zeros(self.shape, dtype=self.dtype, device=device)
+        return wp.full(self.shape, self.fill, dtype=self.dtype, device=device)
+
+
+def fields(owner, shape, **types) -> list[Array]:
+    """Return arrays of one shape for fields of a struct, by their types."""
+    return [Array(owner, name, dtype, shape) for name, dtype in types.items()]
+
+
+class Stage:
+    """One step of an operator. Whatever it does not override it does not have.
+
+    Attributes:
+        operator: The operator that it belongs to, from `attach` on.
+        distance: `PairDistance` that it is given, or None.
+    """
+
+    operator: Any
+    distance: Any = None
+
+    def attach(self, operator: Any):
+        """Take the operator, whose batch and guard are in place, and make what has no room of its own."""
+        self.operator = operator
+
+    def kernels(self, device) -> list:
+        """Return the kernels of its first launch with their block sizes, those first that take longest to compile."""
+        return []
+
+    def boxes(self, boxes):
+        """Return what boxes objects for the broad phase: these, perhaps wider, or others in their place."""
+        return boxes
+
+    def arrays(self, rooms: Rooms) -> list[Array]:
+        """Return its arrays where there are so many entries."""
+        return []
+
+    def state_arrays(self) -> list[Array]:
+        """Return its arrays that have an entry a node or tree state; a graph goes on with what there was."""
+        return []
+
+    def prepare(self, rooms: Rooms):
+        """Make what does not belong to the operator fit for so many entries; before its arrays are made."""
+
+    def link(self):
+        """Take note of arrays that are new. Must not fail."""
+
+    def search(self):
+        """Find what it finds of the pairs in place, of which there are some. Launches only."""
+
+    def report(self, count: int | None):
+        """Compute further outputs of so many hits; None: of as many as have room. Launches only."""
+
+    def read(self, found: Any, device: bool, with_rows: bool):
+        """Add its part to what was found, on the host or in arrays of the device, perhaps without rows of hits."""
+
+
+class PairDistance:
+    """Distances of pairs [world units] that a stage reads: one for all, or one a pair beside given pairs.
+
+    Args:
+        name: What errors call it.
+        value: As asked.
+        owner, attribute: What holds the device array of distances, float64 (pair,).
+        check: Returns a value, checked, for a number of pairs, None for those of the broad phase.
+
+    Attributes:
+        value: The distances, NumPy () or (p,); None where kernels write them.
+    """
+
+    def __init__(self, name: str, value, owner, attribute: str, check=check_within):
+        self.name, self.value, self._check = name, value, check
+        self._owner, self._attribute = owner, attribute
+
+    @property
+    def rows(self) -> wp.array:
+        """The device array of distances."""
+        return getattr(self._owner, self._attribute)
+
+    def check(self, value, pair_count: int | None) -> np.ndarray:
+        """Return other distances, checked; None stands for those in place.
+
+        Raises:
+            ValueError: Another shape, or a distance that is negative, infinite or no number.
+        """
+        return self._check(self.value if value is None else value, pair_count)
+
+    def fill(self):
+        """Write the distances to the device."""
+        if self.value is None:
+            return
+        if self.value.ndim == 0:
+            self.rows.fill_(float(self.value))
+        elif len(self.value):
+            source = wp.array(self.value, dtype=wp.float64, device="cpu", copy=False)
+            wp.copy(self.rows, source, count=len(source))

@@ -1,0 +1,1 @@
+"""Stages of operators, and the operators that users make of them: one file a question."""

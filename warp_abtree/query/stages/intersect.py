@@ -1,0 +1,288 @@
+"""ACTIVE-INTERSECT for a batch: `Query`, and the stages that find which object pairs intersect, or are proved apart."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels.base.lanes import WARP_SIZE
+from warp_abtree.kernels.inside.containment import find_contained_kernel
+from warp_abtree.kernels.intersect import face_pairs, near_faces
+from warp_abtree.query.operator import Operator
+from warp_abtree.query.request import OUTPUTS, PRECISIONS, check_gap, check_request
+from warp_abtree.query.result import COUNTERS, Found
+from warp_abtree.query.stage import Array, PairDistance, Rooms, Stage
+from warp_abtree.query.stages.traversal import Traversal, traversal_kernels
+
+
+class HitStage(Stage):
+    """A stage that counts hits of each pair.
+
+    Attributes:
+        hits: Device arrays of the last launch, `kernels.intersect.face_pairs.Hits`.
+        counts: Its counters, device int64; rows: hits, then what `COUNTERS` names.
+    """
+
+    counts: wp.array
+
+    def __init__(self):
+        self.hits = face_pairs.Hits()
+
+    def attach(self, operator: Operator):
+        """Take the operator."""
+        super().attach(operator)
+        for name in ("total", "uncertain_total", "inexact_total"):
+            setattr(self.hits, name, wp.zeros(1, dtype=wp.int32, device=operator.device))
+
+    def arrays(self, rooms: Rooms) -> list[Array]:
+        """Return what has an entry a pair."""
+        counts = Array(self, "counts", wp.int64, (1 + len(COUNTERS), max(1, rooms.pairs)), 0)
+        return [Array(self.hits, "any_hit", wp.int32, rooms.pairs, 0), counts]
+
+    def link(self):
+        """Make rows of the counters anew."""
+        for k, name in enumerate(("count", *COUNTERS)):
+            setattr(self.hits, name, self.counts[k])
+
+
+class IntersectStage(HitStage):
+    """Find the faces of each pair that intersect, and with a gap those that are nearer than it.
+
+    Args:
+        output: "any", "count" or "faces".
+        precision: As for `Query`.
+        with_gap: Whether the hits have gaps.
+        reads: Whether results have the hits as rows.
+
+    Attributes:
+        traversal: `Traversal`, which other stages share.
+    """
+
+    traversal: Traversal
+
+    def __init__(self, output="any", precision="exact", with_gap=False, reads=True):
+        super().__init__()
+        self._is_exact, self._with_gap, self._reads = precision == "exact", with_gap, reads and output == "faces"
+        self._mode = int(face_pairs.GAP if with_gap else PRECISIONS[precision])
+        self._output = int(OUTPUTS[output])
+
+    def attach(self, operator: Operator):
+        """Take the operator, and give it the hits."""
+        super().attach(operator)
+        if self._with_gap:
+            self.hits.apart_total = wp.zeros(1, dtype=wp.int32, device=operator.device)
+        self.traversal = Traversal(operator, self._output == int(face_pairs.OUTPUT_ANY))
+        self._no_distance = wp.empty(0, dtype=wp.float64, device=operator.device)
+        operator.hits, operator.traversal = self.hits, self.traversal
+
+    def kernels(self, device) -> list:
+        """Return the kernels of the traversal."""
+        is_any = self._output == int(face_pairs.OUTPUT_ANY)
+        return traversal_kernels(device, current_regime(), self._mode, is_any)
+
+    def arrays(self, rooms: Rooms) -> list[Array]:
+        """Return the arrays of hits, and the lists of face pairs that wait."""
+        lists = {"face": rooms.hits, "uncertain": rooms.uncertain, "inexact": rooms.uncertain if self._is_exact else 0}
+        if self._with_gap:
+            lists["apart"] = rooms.uncertain
+        made = [Array(self.hits, name, wp.vec3i, room) for name, room in lists.items()]
+        return [*super().arrays(rooms), *self.traversal.arrays(rooms), *made]
+
+    def link(self):
+        """Give the operator the counters."""
+        super().link()
+        self.operator.counts = self.counts
+
+    def search(self):
+        """Traverse the pairs in place. Launches only."""
+        within = self.hits.gap if self._with_gap else self._no_distance
+        self.traversal.launch("pairs", within, self.hits, self._mode, self._output)
+
+    def read(self, found: Found, device: bool, with_rows: bool):
+        """Read the hits as rows."""
+        if self._reads and with_rows:
+            self.operator.readout.read_hits(found, device)
+
+
+class ApartStage(HitStage):
+    """Find the pairs that are not proved farther apart than a distance.
+
+    Attributes:
+        hits: any_hit is 0 where a pair is proved apart.
+        within: The distances, device float64 (pair,).
+    """
+
+    within: wp.array
+
+    def __init__(self, within):
+        super().__init__()
+        self.distance = PairDistance("within", within, self, "within")
+
+    def attach(self, operator: Operator):
+        """Take the operator, and give it the proofs."""
+        super().attach(operator)
+        operator.near = self.hits
+
+    def kernels(self, device) -> list:
+        """Return the kernels of the traversal."""
+        return traversal_kernels(device, current_regime(), int(face_pairs.WITHIN), True)
+
+    def boxes(self, boxes):
+        """Return boxes that are wider by half of the distance."""
+        boxes.wide = 0.5 * float(self.distance.value)
+        return boxes
+
+    def arrays(self, rooms: Rooms) -> list[Array]:
+        """Return the arrays of proofs."""
+        return [*super().arrays(rooms), Array(self, "within", wp.float64, rooms.pairs)]
+
+    def search(self):
+        """Find what is not proved apart. Launches only."""
+        traversal = self.operator.traversal
+        traversal.launch("within", self.within, self.hits, int(face_pairs.WITHIN), int(face_pairs.OUTPUT_ANY))
+
+
+class GapStage(Stage):
+    """Distances within which faces of a pair count as near: given, or the sum of what each of its objects has.
+
+    Args:
+        gap: As for `ContactQuery`.
+    """
+
+    def __init__(self, gap):
+        self._gap, self._hits = gap, face_pairs.Hits()
+        self._reach: wp.array | None = None  # part of each object, where the broad phase makes pairs
+
+    def give_to(self, hits, precision: str):
+        """Let hits have the gap of each pair.
+
+        Raises:
+            ValueError: Another precision than "exact".
+        """
+        if precision != "exact":
+            raise ValueError(f"gap: needs precision 'exact', not {precision!r}")
+        self._hits = hits
+        self.distance = PairDistance("gap", None, hits, "gap", lambda value, count: check_gap(value, count, 0))
+
+    def attach(self, operator: Operator):
+        """Take the operator, and check the gap; what the broad phase reads of it goes to the device."""
+        super().attach(operator)
+        gap, count = self._gap, operator.batch.object_count
+        if operator.given is not None:
+            self.distance.value = check_gap(gap, len(operator.given), count)
+        elif isinstance(gap, wp.array) and gap.shape == (count,) and gap.dtype is wp.vec4d:
+            self._reach = gap
+        else:
+            parts, rows = check_gap(gap, None, count), np.zeros((count, 4))
+            rows[:, 3] = 0.5 * parts if parts.ndim == 0 else parts
+            self._reach = wp.array(rows, dtype=wp.vec4d, device=operator.device)
+
+    def boxes(self, boxes):
+        """Return boxes that reach as far."""
+        if self._reach is not None:
+            boxes.reach = self._reach
+        return boxes
+
+    def arrays(self, rooms: Rooms) -> list[Array]:
+        """Return the gaps."""
+        return [Array(self._hits, "gap", wp.float64, max(1, rooms.pairs))]
+
+    def search(self):
+        """Add what the objects of each pair have. Launches only."""
+        if self._reach is not None:
+            operator = self.operator
+            inputs = [operator.pair_batch, self._reach, self._hits.gap]
+            operator.launch_kernel(near_faces.add_reach_kernel, len(operator.pairs), inputs)
+
+
+class InsideStage(Stage):
+    """Find what is inside solids, of the pairs whose surfaces do not meet; nothing where there are no solids.
+
+    Attributes:
+        contained: Face of what is inside, device int32 (pair,).
+    """
+
+    contained: wp.array
+
+    def arrays(self, rooms: Rooms) -> list[Array]:
+        """Return the faces."""
+        solids = self.operator.batch.solids
+        return [] if solids is None else [Array(self, "contained", wp.int32, rooms.pairs)]
+
+    def search(self):
+        """Find it. Launches only."""
+        solids = self.operator.batch.solids
+        if solids is not None:
+            solids.fit()
+            self.operator.launch_all("contained", self._make)
+
+    def _make(self, launch) -> list:
+        operator, near = self.operator, self.operator.near
+        solids: Any = operator.batch.solids
+        near_hit = wp.empty(0, dtype=wp.int32, device=operator.device) if near is None else near.any_hit
+        inputs = [operator.batch.trees, operator.pair_batch, solids.pool, operator.hits, near_hit, self.contained]
+        dim = {"dim": len(operator.pairs), "block_dim": WARP_SIZE, "device": operator.device}
+        prepared = solids.prepare(launch, operator.guard.launched)
+        return [prepared, launch(find_contained_kernel, inputs=inputs, **dim)]
+
+
+class Query(Operator):
+    """Intersection of many object pairs as an operator: allocates once, launches many times.
+
+    `launch()` only launches, so that a CUDA graph can capture it, the first launch too. Make a new query after adding
+    objects to the scene, or filtering pairs where the query runs the broad phase. A captured graph holds until arrays
+    that it uses are replaced: by these, by a change of LODs that takes more tree states than the scene had room for,
+    and by a buffer that grows. `result()` refuses what a stale graph has left. Keep the query as long as its graphs.
+
+    Args:
+        scene: `Scene` or `Batch` whose poses and LODs hold at the time of each launch.
+        output: "any", "count" or "faces".
+        pairs: Object pairs to query, (p, 2); None runs the broad phase in every launch.
+        capacity: `Buffers`, or the face pairs that `faces` has room for.
+        precision: "exact": the sign of every determinant is right. "float32": the sign of the rounded one.
+        within: Distances [world units], one for all pairs or (p,) beside given pairs: tell also which pairs are farther
+            apart. The proof covers all rounding: pairs beyond by less than about 1e-13 of their size stay unproved, by
+            less than 6 s where a rotation is off orthonormal by s, and all for distances from 2^1000 on.
+        sort_pairs: Whether pairs of the broad phase are sorted by their objects.
+
+    Attributes:
+        batch: `Batch` that is queried.
+        hits: Device arrays of the last launch (`kernels.intersect.face_pairs.Hits`), faces in no order.
+        pairs, pair_count: The pairs queried, device vec2i and int32 (1,).
+        near: As `hits` for `within`: any_hit is 0 where a pair is proved apart; None without within.
+
+    Raises:
+        ValueError: An unknown output or precision, bad pairs or distances, a capacity out of range, an empty scene.
+        RuntimeError: A graph is being captured.
+    """
+
+    def __init__(
+        self, scene, output="faces", pairs=None, capacity=None, precision="exact", within=None, sort_pairs=False
+    ):
+        super().__init__(scene, self.plan(output, precision, within), pairs, capacity, output, sort_pairs)
+
+    @staticmethod
+    def plan(output="faces", precision="exact", within=None) -> list[Stage]:
+        """Return the stages of a query.
+
+        Raises:
+            ValueError: An unknown output or precision.
+        """
+        check_request(output, precision)
+        first = [] if within is None else [ApartStage(within)]
+        return [*first, IntersectStage(output, precision), InsideStage()]
+
+    def prove_apart(self):
+        """Find alone the pairs that are not proved apart by `within`. Launches only."""
+        for stage in self.stages:
+            if isinstance(stage, ApartStage) and len(self.pairs):
+                stage.search()
+
+    def set_pairs(self, pairs, within=None):
+        """Query other pairs from now on, in the room there is if they fit; within None keeps the distances.
+
+        Raises:
+            ValueError: Bad pairs or distances, a query that runs the broad phase, or distances for one made without.
+        """
+        self.ask_pairs(pairs, within=within)

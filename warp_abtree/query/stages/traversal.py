@@ -1,0 +1,193 @@
+"""Traversal of object pairs, by warps or by threads of the CPU: launches, and the work that warps share."""
+
+import math
+from functools import partial
+
+import warp as wp
+
+from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
+from warp_abtree.kernels.base.lanes import WARP_SIZE
+from warp_abtree.kernels.exact.predicates import EXACT
+from warp_abtree.kernels.intersect import (
+    descent,
+    dual_tree,
+    face_pairs,
+    near_faces,
+    relative_pose,
+    simd,
+    uncertain_pairs,
+)
+from warp_abtree.kernels.search import load_balance
+from warp_abtree.kernels.search.warp_stack import STACK_LENGTH
+from warp_abtree.query.operator import Operator
+from warp_abtree.query.stage import Array, Rooms
+
+# Warps that one multiprocessor runs at a time by their registers: of the traversal, of float64, of exact signs.
+WARPS_A_PROCESSOR = 16
+FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
+# So that each finds a slot for all that it gives away at once.
+WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
+
+
+def find_passes(mode: int) -> list:
+    """Return the passes over the traversal's lists: kernels, their warps a multiprocessor, threads of a block."""
+    if mode not in (int(EXACT), int(face_pairs.GAP)):
+        return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS)]
+    return [
+        (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS),
+        (uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS),
+        *([(near_faces.find_near_kernel, EXACT_WARPS_A_PROCESSOR, WARP_SIZE)] if mode == int(face_pairs.GAP) else []),
+    ]
+
+
+def traversal_kernels(device, regime, mode: int, is_any: bool) -> list:
+    """Return the kernels of a traversal with block sizes, those first that take longest to compile."""
+    if not regime.uses_warps(device):
+        return [(simd.thread_traversal(mode), WARP_SIZE)]
+    with_distances = mode in (int(face_pairs.WITHIN), int(face_pairs.GAP))
+    passes = [] if mode == int(face_pairs.WITHIN) else reversed(find_passes(mode))
+    return [
+        (dual_tree.warp_traversal(mode, is_any), WARP_SIZE),
+        *[(kernel, block) for kernel, _, block in passes],
+        (relative_pose.relative_poses(with_distances), WARP_SIZE),
+    ]
+
+
+def _clear_slabs(memory: wp.array):
+    memory.numpy()[:, : descent.SLAB_ZEROS] = 0.0
+
+
+class Traversal:
+    """Launches of a dual-tree traversal of an operator's pairs.
+
+    Args:
+        operator: `Operator`.
+        is_any: Whether one hit a pair is enough.
+
+    Attributes:
+        work: `load_balance.Work`, the queue that warps share.
+        slab_memory: Slabs of each thread of the CPU.
+    """
+
+    slab_memory: wp.array
+
+    def __init__(self, operator: Operator, is_any: bool):
+        self.operator, device, regime = operator, operator.device, operator.regime
+        self._is_any = is_any
+        self.work = work = load_balance.Work()
+        slots = load_balance.SLOT_COUNT if operator.uses_warps() else 0
+        # An early hit ends a pair, so that more warps ask in vain.
+        work.warps_per_pair = max(1, regime.warps_per_pair // (2 if is_any else 1))
+        work.counter = wp.zeros(load_balance.COUNTER_COUNT, dtype=wp.int32, device=device)
+        work.flag = wp.zeros(slots, dtype=wp.int32, device=device)
+        work.owner = wp.empty(slots, dtype=wp.vec2i, device=device)
+        work.item = wp.empty(slots * load_balance.SLOT_ITEMS, dtype=wp.int64, device=device)
+        work.small_faces = regime.small_faces
+        work.record = operator.guard.record()
+        operator.guard.write_to(work.record)
+
+    def arrays(self, rooms: Rooms) -> list[Array]:
+        """Return what each thread of the CPU keeps slabs in; the system gives it only what it touches."""
+        operator, threads, words = self.operator, 0, 0
+        if not operator.uses_warps():
+            threads = min(rooms.pairs, operator.regime.cpu_threads or core_count())
+            words = descent.slab_memory_words(int(operator.batch.models.depth.max()))
+        clear = None if threads == 0 else _clear_slabs
+        return [Array(self, "slab_memory", wp.float32, (threads, words), clear)]
+
+    def warp_count(self) -> int:
+        """Return the warps of a launch: more than units, where these are few, so that some wait for donations."""
+        device, room = self.operator.device, len(self.operator.pairs)
+        if not device.is_cuda:
+            return 1
+        warps = max(room, int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1)
+        return min(warps, WARPS_MAX, WARPS_A_PROCESSOR * device.sm_count)
+
+    def stack_length(self) -> int:
+        """Return how many items the stack of a warp holds."""
+        length = self.operator.regime.stack_length
+        return STACK_LENGTH if length is None else min(length, STACK_LENGTH)
+
+    def _cores(self) -> int:
+        """Return how many cores share the traversal; a graph of the CPU has one."""
+        operator = self.operator
+        if operator.uses_warps() or operator.device.is_capturing:
+            return 1
+        # A further core costs some 50 us: many pairs of "any"; else a pair in contact takes the root of its faces.
+        least = 32 if self._is_any else max(1, int(50 / math.sqrt(operator.batch.mean_faces)))
+        # Each has memory for slabs: tests do not depend on which thread takes a pair.
+        return cores_for(len(operator.pairs), least, len(self.slab_memory))
+
+    def launch(self, name: str, within: wp.array, hits, mode: int, output: int):
+        """Launch relative poses, the traversal, and passes over uncertain face pairs.
+
+        Args:
+            name: Of the recorded launches.
+            within: Distances by which boxes are wider [world units], device float64 (pair,); (0,) for none.
+            hits: `Hits` to write.
+            mode, output: As for the kernels, `face_pairs` has them.
+        """
+        operator = self.operator
+        make = partial(self._make, within, hits, mode, output)
+        if operator.device.is_capturing:
+            operator.launch_all(name, make)
+            return
+        given, cores = operator.guard.given(), self._cores()
+        if cores == 1 and not operator.uses_warps():
+            for command in operator.commands.find(f"{name} alone", given, make):
+                command.launch()
+            return
+        first, traversal, *passes = operator.commands.find(name, given, make)
+        first.launch()
+        launch_on_cores(traversal.launch, cores)
+        for command in passes:
+            command.launch()
+
+    def _make(self, within, hits, mode, output, launch) -> list:
+        """Make the launches of `launch`, see `Commands.find`."""
+        operator = self.operator
+        made = self._make_warps if operator.uses_warps() else self._make_threads
+        return made(within, hits, mode, output, launch) + self._make_passes(hits, mode, output, launch)
+
+    def _make_warps(self, within, hits, mode, output, launch) -> list:
+        operator, device = self.operator, self.operator.device
+        posed = operator.batch.trees, operator.pair_batch
+        self.work.warps = self.warp_count()
+        # A warp a block: few pairs lie on as many multiprocessors.
+        first = launch(
+            relative_pose.relative_poses(len(within) > 0),
+            dim=max(len(operator.pairs), len(self.work.flag)),
+            inputs=[output, posed[0], within, posed[1], hits, self.work],
+            block_dim=WARP_SIZE,
+            device=device,
+        )
+        traversal = launch(
+            dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),
+            dim=self.warp_count() * operator.lanes,
+            inputs=[self.stack_length(), output, *posed, hits, self.work],
+            block_dim=WARP_SIZE,
+            device=device,
+        )
+        return [first, traversal]
+
+    def _make_threads(self, within, hits, mode, output, launch) -> list:
+        """Make the launch in which a thread starts all pairs and traverses them, or one for each of the two."""
+        operator, made = self.operator, []
+        for starts, traverses in [(True, True)] if self._cores() == 1 else [(True, False), (False, True)]:
+            steps = relative_pose.ThreadSteps()
+            steps.within, steps.starts, steps.traverses = within, starts, traverses
+            inputs = [output, operator.batch.trees, operator.regime.plain_tests, steps, operator.pair_batch]
+            inputs += [self.slab_memory, hits, self.work]
+            made.append(launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=operator.device))
+        return made
+
+    def _make_passes(self, hits, mode, output, launch) -> list:
+        operator, device, made = self.operator, self.operator.device, []
+        if hits.uncertain is None or not len(hits.uncertain):
+            return []
+        for kernel, warps, block in find_passes(mode):
+            threads = warps * device.sm_count * WARP_SIZE if device.is_cuda else 1
+            asked = [] if kernel is near_faces.find_near_kernel else [output]
+            inputs = [threads, *asked, operator.batch.trees, operator.pair_batch, hits]
+            made.append(launch(kernel, dim=threads, inputs=inputs, block_dim=block, device=device))
+        return made
