@@ -23,10 +23,8 @@ import warp_abtree as ab
 
 from . import tables
 
-CASES = (
-    *("assembly", "baselines", "budget", "build", "coarse", "distance", "exact", "frame"),
-    *("gate", "host", "motion", "query", "robot", "scale", "sweep", "update"),
-)
+NAMES = "assembly baselines budget build coarse distance exact frame gate host motion query robot scale sweep update"
+CASES = tuple(NAMES.split())
 STUDIES = {"paper": "study", "tradeoff": "study", "nightly": "nightly"}  # and the modules that run them
 MODULES = {name: f"bench.cases.{name}" for name in CASES} | {"motion": "bench.motions.case"}
 MODULES |= {"robot": "bench.motions.robot", "gate": "bench.gate.compare"}
@@ -35,14 +33,12 @@ FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figur
 # A case, and a study, takes the options that its function `run` has as arguments.
 OPTIONS = {
     "quick": {"action": "store_true", "default": None, "help": "the smallest sizes, to try a case out"},
-    "largest": {"type": int, "metavar": "FACES", "help": "leave larger meshes out"},
     "models": {"metavar": "DIR", "help": "keep the models there"},
     "plots": {"metavar": "DIR", "help": "draw figures there"},
     "count": {"type": int, "help": "random pairs, and a tenth as many adversarial ones; configurations; or worlds"},
     "out": {"required": True, "metavar": "DIR", "help": "where to write JSON, tables and figures"},
     "only": {"nargs": "+", "metavar": "PART", "help": "run these parts, or cases, alone; others are kept from before"},
     "before": {"metavar": "TREE", "help": "the other checkout"},
-    "processes": {"type": int, "help": "processes that run the oracle"},
 }
 
 
@@ -56,9 +52,7 @@ class Parser(argparse.ArgumentParser):
 def main(argv=None):
     argv = list(sys.argv[1:] if argv is None else argv)
     name = argv[0] if argv else None
-    case = None
-    if name in MODULES:
-        case = importlib.import_module(MODULES[name])
+    case = importlib.import_module(MODULES[name]) if name in MODULES else None
     taken = set(inspect.signature(case.run).parameters) if case else set()
     parser = Parser(prog="python -m bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", choices=[*STUDIES, *CASES])
@@ -81,8 +75,8 @@ def main(argv=None):
     wp.config.log_level = wp.LOG_WARNING
     rows = []
     for row in case.run(options.device, **asked):
-        rows.append(row)
-        print("  ".join(f"{key}={value}" for key, value in row.items()), flush=True)
+        rows.append({key: tables.plain(value) for key, value in row.items()})
+        print("  ".join(f"{key}={value}" for key, value in rows[-1].items()), flush=True)
     if options.json:
         Path(options.json).write_text(json.dumps({**describe_run(), "rows": rows}, indent=1), encoding="utf-8")
     if name in FIGURES and options.plots:

@@ -31,9 +31,8 @@ def mesh_file(name) -> Path | None:
 def real_meshes(pairs) -> dict:
     """Return the models of named tuples of meshes, where the folder in ABTREE_MESHES has all of a tuple."""
     folder = ModelFolder(None)
-    at_hand = {key: names for key, names in pairs.items() if all(map(mesh_file, names))}
-    found = at_hand if os.environ.get("ABTREE_MESHES") else {}
-    return {key: tuple(folder.load([name]) for name in names) for key, names in found.items()}
+    found = [key for key, names in pairs.items() if os.environ.get("ABTREE_MESHES") and all(map(mesh_file, names))]
+    return {key: tuple(folder.load([name]) for name in pairs[key]) for key in found}
 
 
 def knot_model(face_target, folder=None) -> ab.Model:
@@ -67,11 +66,7 @@ class ModelFolder:
         return has_source(name) or any(kept)
 
     def load(self, names, base_faces=10) -> ab.Model:
-        """Return the model of the first name that is at hand; its `name` is that name.
-
-        Raises:
-            ValueError: None is at hand.
-        """
+        """Return the model of the first name that is at hand, its `name`; raise a ValueError where none is."""
         for name in names:
             key, file = (name, base_faces), self.folder and self.file(name, base_faces)
             if key not in self._open and file and file.is_file():

@@ -5,6 +5,10 @@ import numpy as np
 import warp_abtree as ab
 from warp_abtree.checks.quaternions import matrices_of
 
+# Batches of pairs of a knot with itself, their centres at distances.
+KNOT_PAIRS = {"faces": 5000, "pairs": (1, 64, 1024, 8192), "distances": (0.9, 0.2), "repeats": 15}
+FAR, PAIRS_MAX_CLOSE, PAIRS_MAX_CPU = 0.9, 1024, 64  # more pairs take minutes on a CPU, or where they are nearer
+
 
 def knot(face_target):
     """Return a (2, 3) torus knot with a rippled tube: vertices float32 (v, 3), faces int32 (f, 3), about unit size.
@@ -47,6 +51,14 @@ def pair_poses(pair_count, distance, seed=0):
     return poses
 
 
+def knot_batches(device, sizes):
+    """Yield numbers of pairs, and distances of their centres, that do not take long on a device."""
+    for count in sizes["pairs"]:
+        for distance in sizes["distances"]:
+            if count <= (PAIRS_MAX_CPU if device.is_cpu else PAIRS_MAX_CLOSE if distance < FAR else count):
+                yield count, distance
+
+
 def random_poses(reach, *shape, seed=0):
     """Return float64 (*shape, 7): any rotation, positions in a cube that reaches so far from the origin."""
     rng = np.random.default_rng(seed)
@@ -76,8 +88,7 @@ def centre_and_radius(model):
 def scene_of_objects(device, model, poses, world_size=None):
     """Return a scene of a model at poses (n, 7), all in one world or so many in each."""
     scene = ab.Scene(device=device)
-    for i, pose in enumerate(poses):
-        scene.add(model, pose, world=i // world_size if world_size else 0)
+    scene.add_many(model, poses, worlds=np.arange(len(poses)) // world_size if world_size else 0)
     return scene
 
 
@@ -87,11 +98,10 @@ def scene_of_pairs(device, model, poses):
 
 
 def scene_of_poses(device, model_a, model_b, poses):
-    """Return a scene of A at the origin and B at each pose, and its pairs (0, 1), (0, 2), ..."""
+    """Return a scene of A at the origin and B at each pose or matrix, and its pairs (0, 1), (0, 2), ..."""
     scene = ab.Scene(device=device)
     scene.add(model_a)
-    for pose in poses:
-        scene.add(model_b, pose)
+    scene.add_many(model_b, poses)
     return scene, np.stack([np.zeros(len(poses), np.int32), np.arange(1, len(poses) + 1, dtype=np.int32)], 1)
 
 
@@ -99,10 +109,7 @@ def place_at_gaps(model, count):
     """Return matrices of B, rotations random, 0.3 to 0.01 of the size away from A, evenly in the logarithm."""
     size, rng = longest_side(model), np.random.default_rng(0)
     matrices = pose_matrices(random_poses(0.0, count))
-    away = rng.normal(size=(count, 3))
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    vertices = model.mesh_at(model.lod_max)[0]
-    middle = (vertices.max(0) + vertices.min(0)) / 2
+    away, (middle, _) = random_directions(rng, count, 3), centre_and_radius(model)
     start = middle - np.einsum("nij,j->ni", matrices[:, :3, :3], middle)
     low, high, gaps = np.zeros(count), np.full(count, 3 * size), size * np.geomspace(0.3, 0.01, count)
     for _ in range(25):

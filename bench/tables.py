@@ -27,19 +27,15 @@ DIGITS = 5  # significant ones of a number that is kept
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 DASHES = ("-", "--", ":", "-.")
-STYLE = {
-    "svg.hashsalt": "warp_abtree",
-    "svg.fonttype": "none",
-    "font.size": 9,
-    "lines.markersize": 4,
-    "lines.linewidth": 1.4,
-}
+STYLE = {"svg.hashsalt": "warp_abtree", "svg.fonttype": "none"}
+STYLE |= {"font.size": 9, "lines.markersize": 4, "lines.linewidth": 1.4}
 PANEL = (4.6, 3.9)  # inches
 
 
 def read_layout(name) -> dict:
-    """Return the tables and figures of a TOML file of this folder."""
-    return tomllib.loads((HERE / name).read_text(encoding="utf-8"))
+    """Return the tables and figures of a TOML file of this folder; a table's part is by default that of its name."""
+    layout = tomllib.loads((HERE / name).read_text(encoding="utf-8"))
+    return layout | {"table": [{"name": key, "part": key} | table for key, table in layout.get("table", {}).items()]}
 
 
 def pick(rows, **where) -> list:
@@ -50,13 +46,10 @@ def pick(rows, **where) -> list:
 
 def plain(value):
     """Return a value of a row as JSON keeps it: floats to `DIGITS` significant digits, no NaN."""
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, int | np.integer):
-        return int(value)
-    if isinstance(value, float | np.floating):
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, float):
         return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None
-    if value is None or isinstance(value, str):
+    if value is None or isinstance(value, bool | int | str):
         return value
     raise TypeError(f"a row holds a {type(value).__name__}")
 
@@ -75,10 +68,8 @@ def write_json(path, study):
 
 def shown(value, form="") -> str:
     """Return a value as a table prints it."""
-    if value is None:
-        return "-"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
+    if value is None or isinstance(value, bool):
+        return {None: "-", True: "yes", False: "no"}[value]
     return value.replace("|", "\\|") if isinstance(value, str) else format(value, form)
 
 
@@ -88,17 +79,19 @@ def select_rows(layout, study):
     A layout's `rows` are texts, each with the values of one row of the study in it.
     """
     if "rows" in layout:
-        return [show_row(row, study) for row in layout["rows"]]
+        return [row for part in layout["rows"] for row in show_rows(part, layout["columns"], study)]
     rows = pick(study["parts"].get(layout["part"], {"rows": []})["rows"], **layout.get("where", {}))
     if rows and "select" in layout:
         rows = importlib.import_module(f"bench.studies.{study['study']}").SUMMARIES[layout["select"]](rows)
     return rows
 
 
-def show_row(layout, study) -> dict:
-    """Return the texts of a row, its values filled in."""
+def show_rows(layout, columns, study) -> list:
+    """Return rows of texts, the values of one row of the study filled in."""
     (row,) = pick(study["parts"][layout["part"]]["rows"], **layout["where"])
-    return {name: text.format(**row) for name, text in layout["show"].items()}
+    return [
+        {name: text.format(**row) for (name, _), text in zip(columns, texts, strict=True)} for texts in layout["show"]
+    ]
 
 
 def markdown_table(layout, study, short=None) -> str:
@@ -107,12 +100,13 @@ def markdown_table(layout, study, short=None) -> str:
     rows = pick(select_rows(layout, study), **short.get("where", {}))
     if not rows:
         return "Not measured in this run."
-    columns = [(name, heading, *form, "")[:3] for name, heading, *form in layout["columns"]]
-    columns = [column for column in columns if column[0] in short.get("columns", [column[0]])]
-    left = [any(isinstance(row.get(name), str) for row in rows) for name, _, _ in columns]
-    lines = [[heading for _, heading, _ in columns], ["---" if is_left else "--:" for is_left in left]]
-    lines += [[shown(row.get(name), form) for name, _, form in columns] for row in rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    columns = []
+    for name, heading, *form in layout["columns"]:
+        if name in short.get("columns", [name]):
+            values = [row.get(name) for row in rows]
+            rule = "---" if any(isinstance(value, str) for value in values) else "--:"
+            columns.append([heading, rule, *(shown(value, *form) for value in values)])
+    return "\n".join("| " + " | ".join(line) + " |" for line in zip(*columns))
 
 
 def markdown_run(study) -> str:
@@ -142,7 +136,7 @@ def study_page(study) -> str:
     title = layout.get("title", f"Study {study['study']}: {', '.join(devices) or 'nothing'}")
     blocks = [f"# {title}", markdown_run(study)]
     for table in layout["table"]:
-        if table.get("part") in study["parts"]:
+        if table["part"] in study["parts"]:
             blocks += [f"## {table['title']}"] + [ran[table["part"]]] * (len(set(ran.values())) > 1)
             blocks += [markdown_table(table, study)] + ([table["note"]] if "note" in table else [])
     blocks += [note for part in study["parts"].values() for note in part["notes"]]
@@ -152,10 +146,7 @@ def study_page(study) -> str:
 def fill_page(text, name, study) -> str:
     """Return the text of a page with the tables of a file of rows in their places, each with its device and command.
 
-    Of a layout that has `short` only that is shown.
-
-    Raises:
-        ValueError: The layout has no such table.
+    Of a layout that has `short` only that is shown; a table that has none is a ValueError.
     """
     layouts = {table["name"]: table for table in read_layout(f"studies/{study['study']}.toml")["table"]}
 
@@ -165,7 +156,7 @@ def fill_page(text, name, study) -> str:
         if place["table"] not in layouts:
             raise ValueError(f"no table {place['table']} in bench/studies/{study['study']}.toml")
         layout, said = layouts[place["table"]], ""
-        if "part" in layout:
+        if layout["part"] in study["parts"]:
             said = f"\n{say_run(study['parts'][layout['part']]['run'])} "
         return f"{place[1]}{markdown_table(layout, study, layout.get('short'))}\n{said}{place[4]}"
 
@@ -187,10 +178,10 @@ def draw(figures, rows, folder) -> str:
     """Draw figures of rows as SVG; return the line that says what was drawn, or why nothing was.
 
     Args:
-        figures: As in a layout: file, and panels side by side, each with title, x and y (columns, y with what they are
-            called), xlabel, ylabel; also where (column to value), by (column whose values are lines of their own),
-            unit (the word after these values), split (column whose values are panels of their own), slope (whether
-            labels show it), xscale and yscale ("log").
+        figures: As in a layout: file, and panels side by side (none is one), each with title, x and y (columns, y with
+            what they are called), xlabel, ylabel; also where (column to value), by (column whose values are lines of
+            their own), unit (the word after these values), split (column whose values are panels of their own), slope
+            (whether labels show it), xscale and yscale ("log"). A panel takes what it does not say from its figure.
         rows: A list; or a function that returns those of a figure.
     """
     try:
@@ -204,7 +195,8 @@ def draw(figures, rows, folder) -> str:
     with matplotlib.rc_context(STYLE):
         for figure in figures:
             found = rows(figure) if callable(rows) else rows
-            panels = [pair for panel in figure["panels"] for pair in split_panel(panel, found)]
+            whole = {key: value for key, value in figure.items() if key not in ("where", "panels")}
+            panels = [pair for panel in figure.get("panels", [{}]) for pair in split_panel(whole | panel, found)]
             panels = [(panel, lines) for panel, own in panels if (lines := find_lines(own, panel))]
             if not panels:
                 continue
@@ -245,9 +237,9 @@ def find_lines(rows, panel) -> dict:
 
 def draw_panel(axes, panel, lines):
     columns, parts = list(panel["y"]), panel.get("order") or list(dict.fromkeys(part for _, part in lines))
-    for set_scale, name in ((axes.set_xscale, "xscale"), (axes.set_yscale, "yscale")):
-        scale = panel.get(name, "log")
-        set_scale(scale, **({"linthresh": panel["least"], "linscale": 0.4} if scale == "symlog" else {}))
+    axes.set_xscale(panel.get("xscale", "log"))
+    scale = panel.get("yscale", "log")
+    axes.set_yscale(scale, **({"linthresh": panel["least"], "linscale": 0.4} if scale == "symlog" else {}))
     for (column, part), points in lines.items():
         x, y = zip(*(points if panel.get("unsorted") else sorted(points)), strict=True)
         name = f"{part:,} {panel['unit'].removesuffix('s' if part == 1 else '')}" if "unit" in panel else part

@@ -84,6 +84,21 @@ def time_in_turn(launches: dict, device, repeats=15, clock=time.perf_counter) ->
     return time_rounds(make_runs(launches, device, clock), repeats)
 
 
+def to_host(query):
+    """Return a callable that launches a query and returns its result."""
+    return lambda: (query.launch(), query.result())[1]
+
+
+def time_on_host(calls: dict, device, repeats) -> dict:
+    """Return the sorted times [ms] of calls that return their answers, in turn.
+
+    On the CPU the time that the thread ran, whatever else the machine does; a GPU works while the thread waits.
+    """
+    clock = time.thread_time if device.is_cpu else time.perf_counter
+    with no_garbage_collection():
+        return time_in_turn(calls, wp.get_device("cpu"), repeats, clock)
+
+
 def medians(times: dict) -> dict:
     """Return the median of each list of times."""
     return {name: float(np.median(values)) for name, values in times.items()}

@@ -30,7 +30,8 @@ def count_differences(found, truth):
 
 
 def judge_disputed(found, ours, meshes, poses, name, most=None):
-    """Let the oracle decide face pairs that only one side reports; return how many, None without the oracle.
+    """Let the oracle decide face pairs that only one side reports; return how many, None without the oracle; raise a
+    RuntimeError where the library is wrong in one of them.
 
     Args:
         found, ours: Rows (pair, face of A, face of B) of a baseline and of the library.
@@ -38,9 +39,6 @@ def judge_disputed(found, ours, meshes, poses, name, most=None):
         poses: Called with a pair; returns the poses of A and B.
         name: Of the baseline.
         most: Judge about so many, evenly chosen; None judges all.
-
-    Raises:
-        RuntimeError: The library is wrong in one of them.
     """
     oracle = load_oracle()
     if oracle is None:

@@ -9,6 +9,17 @@ import numpy as np
 ALL_CONTACTS = 2**31 - 1
 
 
+def make_tree(vertices, faces):
+    """Return a BVHModel of a mesh."""
+    import fcl
+
+    tree = fcl.BVHModel()
+    tree.beginModel(len(vertices), len(faces))
+    tree.addSubModel(vertices, faces)
+    tree.endModel()
+    return tree
+
+
 class Fcl:
     """python-fcl.
 
@@ -35,37 +46,31 @@ class Fcl:
         if self.convex:
             corners = np.concatenate([np.full((len(faces), 1), 3), faces], 1).flatten()
             return self.fcl.Convex(vertices, len(faces), corners)
-        tree = self.fcl.BVHModel()
-        tree.beginModel(len(vertices), len(faces))
-        tree.addSubModel(vertices, faces)
-        tree.endModel()
-        return tree
+        return make_tree(vertices, faces)
 
     def place(self, matrices):
         """Make an object of B for each pose."""
         transforms = [self.fcl.Transform(matrix[:3, :3], matrix[:3, 3]) for matrix in matrices]
         self.b = [self.fcl.CollisionObject(self.shape_b, transform) for transform in transforms]
 
-    def _collide(self, request):
+    def _collide(self, request, poses):
         answers = []
-        for b in self.b:
+        for b in self.b[poses]:
             result = self.fcl.CollisionResult()
             self.fcl.collide(self.a, b, request, result)
             answers.append(result)
         return answers
 
-    def any(self):
-        return [result.is_collision for result in self._collide(self.yes_no)]
+    def any(self, poses=slice(None)):
+        return [result.is_collision for result in self._collide(self.yes_no, poses)]
 
-    def faces(self):
-        return self._collide(self.all)
+    def faces(self, poses=slice(None)):
+        return self._collide(self.all, poses)
 
     def distances(self, poses=slice(None)):
         """Return the distance at each of some poses, negative or 0 where A and B intersect."""
-        request, answers = self.fcl.DistanceRequest(), []
-        for b in self.b[poses]:
-            answers.append(self.fcl.distance(self.a, b, request, self.fcl.DistanceResult()))
-        return np.array(answers)
+        ask, request = self.fcl.distance, self.fcl.DistanceRequest()
+        return np.array([ask(self.a, b, request, self.fcl.DistanceResult()) for b in self.b[poses]])
 
     def first_contacts(self, ends, tolerance=1e-4):
         """Return when A, at rest, and B first touch on B's way to each of some matrices (n, 4, 4), 1 if never.
@@ -73,24 +78,47 @@ class Fcl:
         By conservative advancement, the origin on a straight line, constant angular velocity.
         """
         fcl, still, answers = self.fcl, self.fcl.Transform(), []
+        request = fcl.ContinuousCollisionRequest(toc_err=tolerance, ccd_motion_type=1, ccd_solver_type=1)
         for b, end in zip(self.b, ends, strict=True):
-            request = fcl.ContinuousCollisionRequest(toc_err=tolerance, ccd_motion_type=1, ccd_solver_type=1)
-            result = fcl.ContinuousCollisionResult()
-            answers.append(
-                fcl.continuousCollide(self.a, still, b, fcl.Transform(end[:3, :3], end[:3, 3]), request, result)
-            )
+            end, result = fcl.Transform(end[:3, :3], end[:3, 3]), fcl.ContinuousCollisionResult()
+            answers.append(fcl.continuousCollide(self.a, still, b, end, request, result))
         return np.array(answers)
-
-    def ask_one(self, pose, output):
-        """Return the answer at one pose."""
-        result = self.fcl.CollisionResult()
-        self.fcl.collide(self.a, self.b[pose], self.yes_no if output == "any" else self.all, result)
-        return result
 
     @staticmethod
     def face_pairs(answer):
         """Return the face numbers in one answer, (k, 2)."""
         return [(contact.b1, contact.b2) for contact in answer.contacts]
+
+
+class FclRobot:
+    """python-fcl, asked what a robot is asked: a BVHModel a link, pair by pair until two intersect.
+
+    Args:
+        robot: `ab.Robot`.
+        around: `ab.Model` of what surrounds it.
+    """
+
+    def __init__(self, robot, around):
+        import fcl
+
+        self.fcl, self.robot = fcl, robot
+        self.around, *self.parts = (
+            fcl.CollisionObject(make_tree(*model.mesh_at(model.lod_max)[:2]), fcl.Transform())
+            for model in (around, *robot.models)
+        )
+        moving = [k for k, link in enumerate(robot.model_link) if link not in robot.mounted]
+        self.pairs = [(self.parts[k], self.around) for k in reversed(moving)]
+        self.pairs += [(self.parts[i], self.parts[j]) for i, j in robot.pairs.tolist()]
+
+    def any(self, poses):
+        """Return whether parts meet at each of some link poses (c, links, 4, 4)."""
+        return np.array([self._meets(row[self.robot.model_link]) for row in poses])
+
+    def _meets(self, matrices):
+        for part, matrix in zip(self.parts, matrices):
+            part.setTransform(self.fcl.Transform(matrix[:3, :3], matrix[:3, 3]))
+        request = self.fcl.CollisionRequest()
+        return any(self.fcl.collide(a, b, request, self.fcl.CollisionResult()) for a, b in self.pairs)
 
 
 class Trimesh:

@@ -1,9 +1,8 @@
 """Newton's mesh-mesh narrow phase, where the package `newton` is installed: by BVH, and by SDF (CUDA only).
 
 Another question, and an approximate answer: it looks for points of the edges of one mesh inside the other and keeps a
-few contacts a pair, without face numbers, so only whether a pair intersects can be compared. All shapes share one mesh,
-or the first and the second of each pair; margins and gaps are 0, so that contacts are those of surfaces that pass
-through each other.
+few contacts a pair, without face numbers, so only whether a pair intersects can be compared. All shapes share one mesh;
+margins and gaps are 0, so that contacts are those of surfaces that pass through each other.
 """
 
 import warnings
@@ -19,7 +18,25 @@ CANDIDATES_PER_HIT = 4
 
 
 class Pipeline:
-    """A `newton.CollisionPipeline` with its state and contacts, in the attributes of these names."""
+    """A `newton.CollisionPipeline` over pairs of shapes that follow one another, with its state and contacts.
+
+    Args:
+        contacts, candidates: How many it has room for, of the latter a million at least.
+        options: More of the pipeline's.
+    """
+
+    def __init__(self, model, contacts, candidates, **options):
+        import newton
+
+        self.model, self.state = model, model.state()
+        pairs = np.arange(model.shape_count).reshape(-1, 2)
+        options |= {"broad_phase": "explicit", "verify_buffers": False}
+        options["shape_pairs_filtered"] = wp.array(pairs, dtype=wp.vec2i, device=model.device)
+        room = {"rigid_contact_max": contacts, "max_triangle_pairs": max(1_000_000, candidates)}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large buffers
+            self.pipeline = newton.CollisionPipeline(model, **room, **options)
+            self.contacts = self.pipeline.contacts()
 
     def place(self, poses):
         """Move all bodies, float32 (n, 7)."""
@@ -42,56 +59,39 @@ class Pipeline:
                 raise RuntimeError(f"Newton lost {count} {what}")
 
 
+def finalize(builder, device):
+    """Return the model of a `newton.ModelBuilder`."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of inertia
+        return builder.finalize(device=device)
+
+
 class Newton(Pipeline):
     """Newton's pipeline over given pairs of one mesh.
 
     Args:
         poses: Float32 (2 p, 7), the two objects of a pair one after the other.
-        other: Vertices and faces of the first object of each pair; None is the same mesh.
         hits: About how many face pairs intersect, for the size of its buffers.
         sdf: Voxels along the longest side of a signed distance field, 0 for the BVH.
-
-    Raises:
-        ImportError: Newton is not installed.
     """
 
-    def __init__(self, vertices, faces, poses, hits, device, sdf=0, other=None):
+    def __init__(self, vertices, faces, poses, hits, device, sdf=0):
         import newton
 
         self.pair_count = len(poses) // 2
-        meshes = []
-        for points, corners in [(vertices, faces)] if other is None else [other, (vertices, faces)]:
-            mesh = newton.Mesh(points, corners.reshape(-1), compute_inertia=False)
-            if sdf:
-                mesh.build_sdf(device=device, max_resolution=sdf)
-            meshes.append(mesh)
+        mesh = newton.Mesh(vertices, faces.reshape(-1), compute_inertia=False)
+        if sdf:
+            mesh.build_sdf(device=device, max_resolution=sdf)
         builder = newton.ModelBuilder()
         config = newton.ModelBuilder.ShapeConfig(density=0.0, margin=0.0, gap=0.0)
-        for i, pose in enumerate(poses.tolist()):
-            body = builder.add_body(xform=wp.transform(*pose), mass=1.0)
-            builder.add_shape_mesh(body, mesh=meshes[i % len(meshes)], cfg=config)
-        pairs = wp.array(np.arange(2 * self.pair_count).reshape(-1, 2), dtype=wp.vec2i, device=device)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of inertia, and of large buffers
-            self.model = builder.finalize(device=device)
-            self.pipeline = newton.CollisionPipeline(
-                self.model,
-                broad_phase="explicit",
-                shape_pairs_filtered=pairs,
-                rigid_contact_max=CONTACTS_PER_PAIR * self.pair_count,
-                max_triangle_pairs=max(1_000_000, CANDIDATES_PER_HIT * hits),
-                contact_reduction_hashtable_size_factor=1.0,
-                verify_buffers=False,
-            )
-            self.state = self.model.state()
-            self.contacts = self.pipeline.contacts()
+        for pose in poses.tolist():
+            builder.add_shape_mesh(builder.add_body(xform=wp.transform(*pose), mass=1.0), mesh=mesh, cfg=config)
+        room = CONTACTS_PER_PAIR * self.pair_count, CANDIDATES_PER_HIT * int(hits)
+        super().__init__(finalize(builder, device), *room, contact_reduction_hashtable_size_factor=1.0)
 
     def result(self):
-        """Return whether each pair has a contact, bool (p,), and the number of contacts.
-
-        Raises:
-            RuntimeError: It lost something for lack of room, or has contacts between objects of different pairs.
-        """
+        """Return whether each pair has a contact, bool (p,), and their number; raise a RuntimeError where some are lost
+        for lack of room, or are between objects of different pairs."""
         self.check()
         count = int(self.contacts.rigid_contact_count.numpy()[0])
         first, second = (getattr(self.contacts, f"rigid_contact_shape{i}").numpy()[:count] // 2 for i in (0, 1))
@@ -102,8 +102,7 @@ class Newton(Pipeline):
     def compare(self, any_hit):
         """Return columns: contacts kept, pairs that it misses and invents beside the exact answer, bool (p,)."""
         found, count = self.result()
-        missed, invented = int((any_hit & ~found).sum()), int((found & ~any_hit).sum())
-        return {"contacts": count, "any_missed": missed, "any_invented": invented}
+        return {"contacts": count, "any_missed": (any_hit & ~found).sum(), "any_invented": (found & ~any_hit).sum()}
 
 
 def make_newton(vertices, faces, poses, hits, device):

@@ -6,7 +6,6 @@ do. Fields need CUDA; on the CPU its BVH takes their place. The bolt is a body a
 """
 
 import time
-import warnings
 from functools import partial
 
 import numpy as np
@@ -14,8 +13,9 @@ import warp as wp
 
 import warp_abtree as ab
 
-from ..timing import make_replay, medians, time_call, time_events, time_rounds
-from .newton import Pipeline
+from ..memory import used_memory
+from ..timing import medians, time_in_turn
+from .newton import Pipeline, finalize
 
 RESOLUTION, BAND = 512, 0.005
 GAP, EXAMPLE_GAP = 5e-5, 0.005  # [m] a shape
@@ -25,40 +25,26 @@ POINTS = 32
 # `collide` makes, is twice the memory and nearly twice the time.
 OURS = {"ours": (None, 62_000), "ours_10um": (1e-5, 20_000), "ours_30um": (3e-5, 9_000)}
 FIELDS = tuple(f"rigid_contact_{name}" for name in ("shape0", "shape1", "point0", "point1", "normal"))
-ROOM_TRIES = 4
+ROOM_TRIES = 4  # each with four times the room
 
 
-class Fields:
-    """Newton's meshes of bolt and nut, on CUDA with fields of distances.
+def cook_meshes(models, device):
+    """Return Newton's meshes of bolt and nut, on CUDA with fields of distances, and the time of these [s]."""
+    import newton
 
-    Attributes:
-        meshes: `newton.Mesh` of each.
-        seconds: What each round of cooking both took; the first compiles.
-        mib: Device memory of the fields.
-    """
-
-    def __init__(self, models, device):
-        import newton
-
-        self.seconds = []
-        parts = [model.mesh_at(model.lod_max)[:2] for model in models]
-        before = used_memory(device)
-        for _ in range(2 if device.is_cuda else 1):
-            self.meshes = []
-            self.meshes = [newton.Mesh(v.astype(np.float32), f.reshape(-1)) for v, f in parts]
-            begin = time.perf_counter()
-            for mesh in self.meshes if device.is_cuda else []:
-                band = (-BAND, BAND)
-                mesh.build_sdf(device=device, max_resolution=RESOLUTION, narrow_band_range=band, margin=EXAMPLE_GAP)
-            wp.synchronize_device(device)
-            self.seconds.append(round(time.perf_counter() - begin, 3))
-        self.mib = used_memory(device) - before
-
-
-def used_memory(device) -> int:
-    """Return the memory that is taken on a device [MiB]; 0 on the CPU."""
+    parts = [model.mesh_at(model.lod_max)[:2] for model in models]
+    meshes = [newton.Mesh(v.astype(np.float32), f.reshape(-1)) for v, f in parts]
+    begin = time.perf_counter()
+    for mesh in meshes if device.is_cuda else []:
+        band = (-BAND, BAND)
+        mesh.build_sdf(device=device, max_resolution=RESOLUTION, narrow_band_range=band, margin=EXAMPLE_GAP)
     wp.synchronize_device(device)
-    return (device.total_memory - device.free_memory) >> 20 if device.is_cuda else 0
+    return meshes, time.perf_counter() - begin
+
+
+def taken_memory(device) -> float:
+    """Return the memory that is taken on a device [MiB]; 0 on the CPU."""
+    return used_memory(device).get("taken_mib", 0.0)
 
 
 def make_model(meshes, worlds, device):
@@ -70,38 +56,20 @@ def make_model(meshes, worlds, device):
     for mesh in meshes:
         world.add_shape_mesh(world.add_body(), mesh=mesh, cfg=config)
     builder.replicate(world, worlds)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of inertia
-        return builder.finalize(device=device)
+    return finalize(builder, device)
 
 
 class NutFields(Pipeline):
     """Newton's pipeline over given pairs of a bolt and a nut, with room for what it finds."""
 
     def __init__(self, model, gap, poses):
-        import newton
-
-        self.model, self.gap, worlds = model, gap, model.shape_count // 2
-        pairs = wp.array(np.arange(2 * worlds).reshape(-1, 2), dtype=wp.vec2i, device=model.device)
-        self.state, room = model.state(), max(1_000_000, 2000 * worlds)
+        self.gap, worlds = gap, model.shape_count // 2
         for k in range(ROOM_TRIES):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of large buffers
-                self.pipeline = newton.CollisionPipeline(
-                    model,
-                    reduce_contacts=True,
-                    broad_phase="explicit",
-                    shape_pairs_filtered=pairs,
-                    rigid_contact_max=CONTACTS_PER_WORLD * worlds,
-                    max_triangle_pairs=room << 2 * k,
-                    verify_buffers=False,
-                )
-                self.contacts = self.pipeline.contacts()
+            super().__init__(model, CONTACTS_PER_WORLD * worlds, 2000 * worlds << 2 * k, reduce_contacts=True)
             self.place(poses)
             self.launch()
             try:
-                self.check()
-                break
+                return self.check()
             except RuntimeError:
                 if k == ROOM_TRIES - 1:
                     raise
@@ -121,13 +89,12 @@ class Ours:
         self.found, self.state = ab.NewtonContacts(model, shapes, capacity, POINTS), model.state()
         lods = [m.lod_max if tolerance is None else m.lod_for(tolerance=tolerance) for m in models]
         self.found.scene.set_lods(lods * (model.shape_count // 2))
-        self.faces = [len(m.mesh_at(lod)[1]) for m, lod in zip(models, lods)]
+        self.faces = " on ".join(str(len(m.mesh_at(lod)[1])) for m, lod in zip(models[::-1], lods[::-1]))
         self.contacts = self.found.contacts()
         self.place(poses)
         self.found.collide(self.state, self.contacts)
 
-    def place(self, poses):
-        self.state.body_q.assign(poses)
+    place = Pipeline.place
 
     def launch(self):
         self.found.launch(self.state, self.contacts)
@@ -144,22 +111,14 @@ def read_contacts(contacts):
 
 
 def same_twice(one, poses, others):
-    """Return whether contacts have the same bits twice, in order, and whether in any order; other poses between."""
+    """Return whether contacts have the same bits twice, in order; other poses between."""
     found = []
     for placed in (poses, others, poses):
         one.place(placed)
         one.launch()
         found.append(read_contacts(one.contacts))
     one.check()
-    first, _, second = found
-    in_order = np.array_equal(first, second)
-    return in_order, in_order or sorted(map(bytes, first)) == sorted(map(bytes, second))
-
-
-def worlds_with_contacts(one, worlds):
-    """Return which worlds have contacts, bool (worlds,)."""
-    count = int(one.contacts.rigid_contact_count.numpy()[0])
-    return np.isin(np.arange(worlds), one.contacts.rigid_contact_shape0.numpy()[:count] // 2)
+    return np.array_equal(found[0], found[2])
 
 
 def measure(models, matrices, others, device, repeats):
@@ -168,74 +127,47 @@ def measure(models, matrices, others, device, repeats):
     Args:
         models: Bolt and nut.
         matrices, others: Two sets of poses of the nuts in their bolts' frames, (worlds, 4, 4).
-
-    Raises:
-        RuntimeError: Nuts that meet their bolts and nuts whose contacts cross are not the same number.
     """
-    worlds = len(matrices)
-    fields = Fields(models, device)
-    model = make_model(fields.meshes, worlds, device)
+    before, (_, first) = taken_memory(device), cook_meshes(models, device)  # compiles
+    meshes, seconds = cook_meshes(models, device)
+    row = {"device": device.name, "worlds": len(matrices), "fields_mib": taken_memory(device) - before}
+    row |= {"cook_first_s": first, "cook_s": seconds}
+    model = make_model(meshes, len(matrices), device)
     poses, others = (body_poses(m) for m in (matrices, others))
-    row = {"device": device.name, "worlds": worlds, "fields_mib": fields.mib}
-    row |= {"cook_first_s": fields.seconds[0], "cook_s": fields.seconds[-1]}
     kind = "sdf" if device.is_cuda else "bvh"
     gaps = {f"{kind}_same_gap": GAP} | ({f"{kind}_example": EXAMPLE_GAP} if device.is_cuda else {})
     theirs = {}
     for name, gap in gaps.items():
         keep(row, name, partial(NutFields, model, gap, poses), poses, others, device, theirs)
-    for name, given in OURS.items():
-        make = partial(Ours, model, models, *given, poses)
-        time_one(row, name, make, poses, others, device, repeats, dict(theirs))
+    for name, given in OURS.items():  # one goes before the next is made, since all would take too much
+        made = dict(theirs)
+        keep(row, name, partial(Ours, model, models, *given, poses), poses, others, device, made)
+        if name in made:
+            row |= check_ours(name, made[name]) | time_one(name, made, device, repeats)
     return row
 
 
-def time_one(row, name, make, poses, others, device, repeats, made):
-    """Add one of ours to a row, with times in turn with Newton's; it goes again, since all would take too much."""
-    keep(row, name, make, poses, others, device, made)
-    if name not in made:
-        return
-    row[f"{name}_faces"] = made[name].faces
-    check_ours(row, name, made[name])
-    runs, row["graphs"] = timed(made, device)
-    times = medians(time_rounds(runs, repeats))
-    row |= {f"{key}_ms": round(ms, 3) for key, ms in times.items()}
-    row |= {f"{key}_over_{name}": round(ms / times[name], 3) for key, ms in times.items() if key != name}
+def time_one(name, made, device, repeats) -> dict:
+    """Return columns of one of ours: times in turn with Newton's, and their ratios."""
+    times = medians(time_in_turn({key: one.launch for key, one in made.items()}, device, repeats))
+    ratios = {f"{key}_over_{name}": ms / times[name] for key, ms in times.items() if key != name}
+    return {f"{key}_ms": ms for key, ms in times.items()} | ratios
 
 
 def keep(row, name, make, poses, others, device, made):
     """Make a contender and keep it in `made`, or in the row why it cannot be; add what it found to the row."""
-    before = used_memory(device)
+    before = taken_memory(device)
     try:
         one = make()
-        row[f"{name}_same_bits"], row[f"{name}_same_set"] = same_twice(one, poses, others)
+        row[f"{name}_same_bits"] = same_twice(one, poses, others)
     except (RuntimeError, MemoryError) as error:  # what has no room must not cost the rest of a run
         row[f"{name}_skipped"] = f"{type(error).__name__}: {error}"
         return
     made[name] = one
-    row[f"{name}_mib"] = used_memory(device) - before
-    row[f"{name}_contacts"] = len(read_contacts(one.contacts))
-    row[f"{name}_worlds"] = int(worlds_with_contacts(one, row["worlds"]).sum())
-
-
-def timed(made, device):
-    """Return callables that launch and return the time [ms], all in the same way, and whether that is replaying graphs.
-
-    On the CPU each is launched; on CUDA replayed as a graph, or launched between events, each alone on the device, if a
-    graph of any cannot be made: the reason is in the place of True.
-    """
-    if not device.is_cuda:
-        return {name: time_call(one.launch, device) for name, one in made.items()}, False
-    graphs = True
-    replays = {}
-    for name, one in made.items():
-        try:
-            replays[name] = make_replay(one.launch, device)
-            replays[name]()
-        except RuntimeError as error:
-            graphs = f"none of {name}: {error}"
-            replays = {name: one.launch for name, one in made.items()}
-            break
-    return {name: time_events(replay, device) for name, replay in replays.items()}, graphs
+    row[f"{name}_mib"] = taken_memory(device) - before
+    count = int(one.contacts.rigid_contact_count.numpy()[0])
+    row[f"{name}_contacts"] = count
+    row[f"{name}_worlds"] = len(np.unique(one.contacts.rigid_contact_shape0.numpy()[:count] // 2))
 
 
 def body_poses(matrices):
@@ -246,10 +178,10 @@ def body_poses(matrices):
     return poses
 
 
-def check_ours(row, name, ours):
-    """Add how many nuts meet their bolts to a row, and hold the contacts against it; poses are those of a launch."""
+def check_ours(name, ours) -> dict:
+    """Return columns: faces, nuts that meet their bolts, near face pairs; raise where contacts differ from them."""
     found, scene = ours.found.query.result(with_points=False), ours.found.scene
-    row[f"{name}_meet"] = int(scene.intersect(found.pairs, "any").any.sum())
-    row[f"{name}_near"] = int(found.count.sum())
-    if row[f"{name}_meet"] != int(found.any.sum()):
-        raise RuntimeError(f"{row[f'{name}_meet']} nuts meet their bolts, {int(found.any.sum())} have faces that cross")
+    meet, crossing = scene.intersect(found.pairs, "any").any.sum(), found.any.sum()
+    if meet != crossing:
+        raise RuntimeError(f"{meet} nuts meet their bolts, {crossing} have faces that cross")
+    return {f"{name}_faces": ours.faces, f"{name}_meet": meet, f"{name}_near": found.count.sum()}

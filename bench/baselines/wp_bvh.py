@@ -15,17 +15,17 @@ from ..timing import medians, time_in_turn
 wp.set_module_options({"enable_backward": False})
 CONSTRUCTORS = ("sah", "median", "lbvh", "cubql")
 BLOCK_THREADS = 64
+TUNED = 64  # pairs that the constructor is chosen for
 MORTON_BITS = 10  # of each coordinate
 
 
 @wp.struct
 class BvhPairs:
-    """Posed pairs of two meshes, or of one with itself."""
+    """Posed pairs of a mesh with itself."""
 
-    face_count: wp.int32  # of A
-    corners_a: wp.array(dtype=wp.vec3)  # of A, three a face, (3 f,)
-    bvh: wp.uint64  # over the faces of B
-    corners: wp.array(dtype=wp.vec3)  # of B, three a face, (3 f,)
+    face_count: wp.int32
+    bvh: wp.uint64  # over the faces
+    corners: wp.array(dtype=wp.vec3)  # three a face, (3 f,)
     poses: wp.array(dtype=wp.transform)  # of objects, (2 p,)
     relative: wp.array(dtype=wp.transform)  # of each pair, A's frame to B's, (p,)
 
@@ -50,9 +50,9 @@ def find_kernel(yes_no):
             if found_inout[pair] != 0:
                 return
         relative = asked.relative[pair]
-        p = wp.transform_point(relative, asked.corners_a[3 * a])
-        q = wp.transform_point(relative, asked.corners_a[3 * a + 1])
-        r = wp.transform_point(relative, asked.corners_a[3 * a + 2])
+        p = wp.transform_point(relative, asked.corners[3 * a])
+        q = wp.transform_point(relative, asked.corners[3 * a + 1])
+        r = wp.transform_point(relative, asked.corners[3 * a + 2])
         query = wp.bvh_query_aabb(asked.bvh, wp.min(p, wp.min(q, r)), wp.max(p, wp.max(q, r)))
         b = wp.int32(0)
         while wp.bvh_query_next(query, b):
@@ -83,10 +83,8 @@ def morton_order(points) -> np.ndarray:
     """Return the order of points (n, 3) along a Morton curve."""
     low, size = points.min(0), max(np.ptp(points, axis=0).max(), 1e-30)
     cell = ((points - low) / size * (2**MORTON_BITS - 1)).astype(np.int64)
-    code = np.zeros(len(points), np.int64)
-    for bit in range(MORTON_BITS):
-        for axis in range(3):
-            code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
+    bit, axis = np.meshgrid(np.arange(MORTON_BITS), np.arange(3))
+    code = ((cell[:, :, None] >> bit & 1) << (3 * bit + axis)).sum((1, 2))
     return np.argsort(code, kind="stable")
 
 
@@ -95,21 +93,15 @@ class FaceBvh:
 
     Args:
         constructor: One of `CONSTRUCTORS`, None for Warp's own choice.
-        other: Vertices and faces of A, where A is another mesh.
     """
 
-    def __init__(self, vertices, faces, device, constructor=None, other=None):
+    def __init__(self, vertices, faces, device, constructor=None):
         self.device = wp.get_device(device)
         corners = np.asarray(vertices, np.float32)[faces]
         self.face = morton_order(corners.mean(1))
         self.asked = BvhPairs()
         self.asked.corners = wp.array(corners[self.face].reshape(-1, 3), dtype=wp.vec3, device=device)
-        self.face_a, self.asked.corners_a = self.face, self.asked.corners
-        if other is not None:
-            corners = np.asarray(other[0], np.float32)[other[1]]
-            self.face_a = morton_order(corners.mean(1))
-            self.asked.corners_a = wp.array(corners[self.face_a].reshape(-1, 3), dtype=wp.vec3, device=device)
-        self.asked.face_count = len(self.face_a)
+        self.asked.face_count = len(self.face)
         self.boxes = [wp.empty(len(faces), dtype=wp.vec3, device=device) for _ in range(2)]
         self.bvh = None
         self.rebuild()
@@ -129,10 +121,12 @@ class BvhPosed(FaceBvh):
 
     Args:
         capacity: Face pairs that there is room for, None asks yes or no.
+        constructor: None takes the one that answers fastest.
     """
 
-    def __init__(self, vertices, faces, poses, capacity, device, constructor="sah", other=None):
-        super().__init__(vertices, faces, device, constructor, other)
+    def __init__(self, vertices, faces, poses, capacity, device, constructor=None):
+        self.constructor = constructor or find_constructor(vertices, faces, poses[: 2 * TUNED], device)
+        super().__init__(vertices, faces, device, self.constructor)
         self.yes_no = capacity is None
         self.pair_count = len(poses) // 2
         self.asked.poses = wp.array(np.asarray(poses, np.float32), dtype=wp.transform, device=device)
@@ -155,18 +149,18 @@ class BvhPosed(FaceBvh):
         if total > len(self.hits):
             raise RuntimeError(f"the wp.Bvh baseline found {total} face pairs, with room for {len(self.hits)}")
         rows = self.hits.numpy()[:total].reshape(-1, 3)
-        rows = np.stack([rows[:, 0], self.face_a[rows[:, 1]], self.face[rows[:, 2]]], 1).astype(np.int32)
+        rows = np.stack([rows[:, 0], self.face[rows[:, 1]], self.face[rows[:, 2]]], 1).astype(np.int32)
         return rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))]
 
 
-def find_constructor(vertices, faces, poses, device, repeats=5, other=None) -> str:
+def find_constructor(vertices, faces, poses, device, repeats=5) -> str:
     """Return the constructor whose tree answers fastest."""
     launches = {}
     for name in CONSTRUCTORS:
         if name == "lbvh" and device.is_cpu:  # there it is sah
             continue
         try:
-            launches[name] = BvhPosed(vertices, faces, poses, 0, device, name, other).launch
+            launches[name] = BvhPosed(vertices, faces, poses, 0, device, name).launch
         except (RuntimeError, ValueError):  # not compiled in
             continue
     times = medians(time_in_turn(launches, device, repeats))

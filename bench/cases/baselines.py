@@ -6,8 +6,6 @@ over a loop of its own calls, objects made before, until the library has its con
 them.
 """
 
-import time
-
 import numpy as np
 import warp as wp
 
@@ -16,7 +14,7 @@ import warp_abtree as ab
 from ..baselines.fcl import Fcl, Trimesh
 from ..meshes import real_meshes
 from ..shapes import centre_and_radius, knot, pose_matrices, random_directions, scene_of_poses
-from ..timing import no_garbage_collection, one_core, ratio_of, summarise, time_in_turn
+from ..timing import one_core, ratio_of, summarise, time_on_host, to_host
 from ..verify import judge_disputed
 
 REAL = {
@@ -37,9 +35,8 @@ def run(device, quick=False):
     knots = ab.Model.from_arrays(*knot(sizes["faces"]), name="knot")
     for name, models in {"knot-knot": (knots, knots), **real_meshes(REAL)}.items():
         with one_core() as core:
-            about = {"device": device.name, "workload": name, "core": core}
-            for row in Workload(*models, device, sizes).run():
-                yield about | row
+            for row in measure(models, device, sizes["poses"], sizes["repeats"]):
+                yield {"device": device.name, "workload": name, "core": core} | row
 
 
 def random_matrices(rng, model_a, model_b, count):
@@ -51,82 +48,55 @@ def random_matrices(rng, model_a, model_b, count):
     return matrices
 
 
-class Workload:
-    """Two models at poses, half of them in contact, and our queries over them."""
+def half_in_contact(models, count):
+    """Return matrices of B, half of which make it intersect A."""
+    rng, kept = np.random.default_rng(0), {True: [], False: []}
+    while min(map(len, kept.values())) < (count + 1) // 2:
+        matrices = random_matrices(rng, *models, count)
+        for matrix, intersects in zip(matrices, ab.sweep(*models, matrices, device="cpu"), strict=True):
+            kept[bool(intersects)].append(matrix)
+    return rng.permutation([*kept[True][: (count + 1) // 2], *kept[False][: count // 2]])
 
-    def __init__(self, model_a, model_b, device, sizes):
-        self.device, self.repeats, count = device, sizes["repeats"], sizes["poses"]
-        a = model_a.mesh_at(model_a.lod_max)[:2]
-        self.meshes = a, a if model_b is model_a else model_b.mesh_at(model_b.lod_max)[:2]
-        self.scene, pairs = scene_of_poses(device, model_a, model_b, np.tile(np.eye(4), (count, 1, 1)))
-        rng, kept = np.random.default_rng(0), {True: [], False: []}
-        while min(map(len, kept.values())) < (count + 1) // 2:
-            matrices = random_matrices(rng, model_a, model_b, count)
-            self.place(matrices)
-            for matrix, intersects in zip(matrices, self.scene.intersect(pairs, "any").any, strict=True):
-                kept[bool(intersects)].append(matrix)
-        self.matrices = rng.permutation([*kept[True][: (count + 1) // 2], *kept[False][: count // 2]])
-        self.place(self.matrices)
-        self.queries = {output: ab.Query(self.scene, output, pairs=pairs) for output in ("any", "faces")}
 
-    def place(self, matrices):
-        """Pose B at matrices (n, 4, 4)."""
-        self.scene.set_poses(np.concatenate([np.eye(4)[None], matrices]))
-
-    def run(self):
-        """Yield one row a baseline."""
-        answers = {output: query.run() for output, query in self.queries.items()}
-        any_hit, faces = answers["any"].any, answers["faces"].faces
-        if not np.array_equal(any_hit, answers["faces"].count > 0):
-            raise RuntimeError("outputs 'any' and 'faces' of ours differ")
-        about = {"faces": " x ".join(str(len(mesh[1])) for mesh in self.meshes), "poses": len(self.matrices)}
-        about |= {"meet": int(any_hit.sum()), "hits": len(faces)}
-        made, rows = [], {}
-        for kind in BASELINES:
-            try:
-                made.append(kind(*self.meshes, self.matrices))
-            except ImportError as error:
-                rows[kind.name] = {"skipped": str(error)}
-        for baseline in made:
-            rows[baseline.name] = self.compare(baseline, any_hit, faces)
-        times = {output: self.time_output(output, made, any_hit) for output in self.queries}
-        for name in [kind.name for kind in BASELINES]:
-            row = about | {"peer": name} | rows[name]
-            for output, found in times.items():
-                shown = {
-                    f"{who}_{output}": found[key] for who, key in (("ours", "ours"), ("peer", name)) if key in found
-                }
-                row |= summarise(shown)
-                row |= {f"{key}_per_s": round(1e3 * len(self.matrices) / np.median(ms)) for key, ms in shown.items()}
-                if name in found:
-                    row[f"{output}_ratio"] = ratio_of(found[name], found["ours"])
-            yield row
-
-    def compare(self, baseline, found_any, found_faces):
-        """Return what a baseline misses and invents beside our answers, which the oracle must not find wrong."""
-        answer = np.array(baseline.any(), bool)
-        ours = {tuple(row) for row in found_faces.tolist()}
-        theirs = {(pose, *pair) for pose, one in enumerate(baseline.faces()) for pair in baseline.face_pairs(one)}
-        judged = judge_disputed(
-            list(theirs), list(ours), self.meshes, lambda pose: (np.eye(4), self.matrices[pose]), baseline.name
-        )
-        return {
-            "any_missed": int((found_any & ~answer).sum()),
-            "any_invented": int((answer & ~found_any).sum()),
-            "faces_missed": len(ours - theirs),
-            "faces_invented": len(theirs - ours),
-            "ours_wrong": "not judged" if judged is None else 0,
-        }
-
-    def time_output(self, output, made, found_any):
-        """Return the times [ms] of ours and of the baselines by name."""
-        query = self.queries[output]
-        # Of one thread the time that it ran, whatever else the machine does; a GPU works while the thread waits.
-        clock = time.thread_time if self.device.is_cpu else time.perf_counter
-        launches = {"ours": lambda: (query.launch(), query.result())}
-        launches |= {one.name: getattr(one, output) for one in made}
-        with no_garbage_collection():  # on every device as on the CPU: results are read back
-            times = time_in_turn(launches, wp.get_device("cpu"), self.repeats, clock)
-        if not np.array_equal(query.result().any, found_any):
+def measure(models, device, count, repeats):
+    """Yield one row a baseline; raise a RuntimeError where our outputs differ, or the oracle sides with a baseline."""
+    a = models[0].mesh_at(models[0].lod_max)[:2]
+    meshes = a, a if models[1] is models[0] else models[1].mesh_at(models[1].lod_max)[:2]
+    matrices = half_in_contact(models, count)
+    scene, pairs = scene_of_poses(device, *models, matrices)
+    queries = {output: ab.Query(scene, output, pairs=pairs) for output in ("any", "faces")}
+    answers = {output: query.run() for output, query in queries.items()}
+    any_hit, faces = answers["any"].any, answers["faces"].faces
+    if not np.array_equal(any_hit, answers["faces"].count > 0):
+        raise RuntimeError("outputs 'any' and 'faces' of ours differ")
+    about = {"faces": " x ".join(str(len(mesh[1])) for mesh in meshes), "poses": count}
+    about |= {"meet": any_hit.sum(), "hits": len(faces)}
+    made, rows = {}, {}
+    for kind in BASELINES:
+        try:
+            made[kind.name] = kind(*meshes, matrices)
+            rows[kind.name] = compare(made[kind.name], any_hit, faces, meshes, matrices)
+        except ImportError as error:
+            rows[kind.name] = {"skipped": str(error)}
+    for output, query in queries.items():
+        launches = {"ours": to_host(query)} | {name: getattr(one, output) for name, one in made.items()}
+        times = time_on_host(launches, device, repeats)
+        if not np.array_equal(query.result().any, any_hit):
             raise RuntimeError(f"the timed answer of {output!r} differs from the checked one")
-        return times
+        for name in made:
+            shown = {f"ours_{output}": times["ours"], f"peer_{output}": times[name]}
+            rows[name] |= summarise(shown) | {f"{output}_ratio": ratio_of(times[name], times["ours"])}
+            rows[name] |= {f"{key}_per_s": round(1e3 * count / np.median(ms)) for key, ms in shown.items()}
+    for name, row in rows.items():
+        yield about | {"peer": name} | row
+
+
+def compare(baseline, found_any, found_faces, meshes, matrices):
+    """Return what a baseline misses and invents beside our answers, which the oracle must not find wrong."""
+    answer = np.array(baseline.any(), bool)
+    ours = {tuple(row) for row in found_faces.tolist()}
+    theirs = {(pose, *pair) for pose, one in enumerate(baseline.faces()) for pair in baseline.face_pairs(one)}
+    judged = judge_disputed(list(theirs), list(ours), meshes, lambda pose: (np.eye(4), matrices[pose]), baseline.name)
+    row = {"any_missed": (found_any & ~answer).sum(), "any_invented": (answer & ~found_any).sum()}
+    row |= {"faces_missed": len(ours - theirs), "faces_invented": len(theirs - ours)}
+    return row | {"ours_wrong": "not judged" if judged is None else 0}

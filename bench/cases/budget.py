@@ -4,7 +4,7 @@ T is measured first: the median frame at the finest LODs, after the first second
 the CPU time of its thread, so that what else the machine does is left out.
 
 Then what control costs: a budget that the finest LODs keep makes the controller stay there, so that its frames have all
-of its cost and none of its gain; and selection of many LODs alone.
+of its cost and none of its gain.
 """
 
 import contextlib
@@ -14,7 +14,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import trimesh
 import warp as wp
 
 import warp_abtree as ab
@@ -23,7 +22,7 @@ from warp_abtree.lod.timing import STAGES
 from warp_abtree.simulate.budget_report import budget_report
 
 from .. import tables
-from ..timing import medians, one_core, time_in_turn
+from ..timing import medians, one_core, summarise
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 NAMES = ("rain", "focus")
@@ -36,7 +35,6 @@ BREACH = 3.5  # how often the finest LODs take the budget
 CONTROLLED = ("focus", "herd", "rain", "worlds")
 CONTROLLED_OBJECTS = {"cpu": 200, "cuda": None}
 BUDGETS = (2.0, 0.5)
-SELECTED = (1_500, 100_000)  # objects whose LODs are selected
 CONTROLLERS = ("none", "coarsest", "predictive", "paper", "tolerance")
 
 
@@ -55,16 +53,14 @@ def run(device, quick=False, plots=None):
         options = {} if core is None else {"clock": time.thread_time}
         for name in NAMES:
             collect()
-            loaded = load_scene(
-                SCENES / f"{name}.toml", device, objects=QUICK_OBJECTS if quick else OBJECTS[kind][name]
-            )
+            loaded = read_scene(name, device, QUICK_OBJECTS if quick else OBJECTS[kind][name])
             runs, budget = {}, None
             for controller in CONTROLLERS:
                 asked = options if budget is None else options | {"budget_ms": budget}
                 frame = run_controller(loaded, controller, OUTPUT[kind], QUICK_FRAMES if quick else FRAMES, asked)
                 budget = budget or float(np.median(steady_costs(frame))) / BREACH
                 row = {"scene": name, "device": device.name, "objects": loaded.scene.object_count}
-                yield row | {"budget_ms": round(budget, 3), "controller": controller} | describe_hold(frame, budget)
+                yield row | {"budget_ms": budget, "controller": controller} | describe_hold(frame, budget)
                 runs[controller] = frame.history
             if plots is not None:
                 draw_runs(name, runs, budget, plots)
@@ -73,9 +69,11 @@ def run(device, quick=False, plots=None):
         if name == "herd" and importlib.util.find_spec("pxr") is None:
             continue  # its meshes need usd-core
         objects = QUICK_OBJECTS if quick else CONTROLLED_OBJECTS[kind]
-        yield from compare(load_scene(SCENES / f"{name}.toml", device, objects=objects), name, frames)
-    for count in SELECTED[: 1 if quick else 2]:
-        yield from time_selection(device, count)
+        yield from compare(read_scene(name, device, objects), name, frames)
+
+
+def read_scene(name, device, objects):
+    return load_scene(SCENES / f"{name}.toml", device, objects=objects)
 
 
 def collect():
@@ -107,30 +105,20 @@ def describe_hold(frame, budget):
     """Return the columns of one run."""
     found, costs = budget_report(frame.history, budget), steady_costs(frame)
     rows = [row for row in frame.history if row.time >= 1.0]
-    digits = {"within": 4, "within_110_percent": 4, "worst": 2, "oscillations": 3, "error_mean": 5}
-    return {"judged": found["frames"]} | {
-        **{name: round(found[name], count) for name, count in digits.items()},
-        "cost_ms": round(float(np.median(costs)), 3),
-        "cost_p95_ms": round(float(np.percentile(costs, 95)), 3),
-        "error_max": round(max(row.error_max for row in rows), 5),
-        "faces": round(float(np.mean([row.faces for row in rows]))),
-        "hits": round(float(np.mean([row.hits for row in rows]))),
-    }
+    names = ("within", "within_110_percent", "worst", "oscillations", "error_mean")
+    row = {"judged": found["frames"]} | {name: found[name] for name in names} | summarise({"cost": costs})
+    row |= {"error_max": max(row.error_max for row in rows)}
+    return row | {name: round(np.mean([getattr(row, name) for row in rows])) for name in ("faces", "hits")}
 
 
 def draw_runs(name, runs, budget, folder):
     """Draw frame times over T, faces and certified errors of a scene under each controller."""
-    rows = [
-        {
-            "controller": controller,
-            "frame": i,
-            "cost": row.total_ms / budget,
-            "faces": row.faces,
-            "error": row.error_mean,
-        }
-        for controller, history in runs.items()
-        for i, row in enumerate(history)
-    ]
+    rows = []
+    for controller, history in runs.items():
+        about = {"controller": controller}
+        for i, row in enumerate(history):
+            cost = {"cost": row.total_ms / budget, "faces": row.faces, "error": row.error_mean}
+            rows.append(about | {"frame": i} | cost)
     (figure,) = tables.pick(tables.read_layout("cases/figures.toml")["figure"], case="budget")
     print(tables.draw([figure | {"file": f"budget-{name}.svg"}], rows, folder), flush=True)
 
@@ -143,10 +131,10 @@ def compare(loaded, name, frames):
         controlled = run_frames(loaded, frames, budget)
         finest += run_frames(loaded, frames, None)
         stand, total = (float(np.median([row.total_ms for row in rows])) for rows in (finest, controlled))
-        stages = {stage: round(float(np.median([getattr(row, stage) for row in controlled])), 4) for stage in STAGES}
+        stages = medians({stage: [getattr(row, stage) for row in controlled] for stage in STAGES})
         row = {"scene": name, "device": loaded.scene.device.name, "objects": loaded.scene.object_count}
-        row |= {"budget": part, "finest_ms": round(stand, 4), "total_ms": round(total, 4)}
-        yield row | stages | {"error_mean": controlled[-1].error_mean, "ratio": round(total / stand, 3)}
+        row |= {"budget": part, "finest_ms": stand, "total_ms": total} | stages
+        yield row | {"error_mean": controlled[-1].error_mean, "ratio": total / stand}
 
 
 def run_frames(loaded, frames, budget):
@@ -160,25 +148,3 @@ def run_frames(loaded, frames, budget):
     frame.warm_up()
     collect()
     return frame.run(frames)[frames // 2 :]
-
-
-def time_selection(device, count):
-    """Yield a row a controller that selects LODs of so many objects."""
-    sections = (48, 44, 40)
-    models = [ab.Model.load(trimesh.creation.torus(0.5, 0.2, major_sections=n, minor_sections=24)) for n in sections]
-    scene, places = ab.Scene(device), np.random.default_rng(0).uniform(-20, 20, (count, 3))
-    for i, place in enumerate(places):
-        scene.add(models[i % 3], pose=(*place, 0, 0, 0, 1), importance=1 + i % 3)
-    camera = ab.Camera.look_at((0, 0, 30), (0, 0, 0))
-    made = {
-        "predictive": ab.PredictiveController(scene, 10.0, camera),
-        "paper": ab.PaperController(scene, 10.0, camera),
-        "tolerance": ab.ToleranceController(scene, 0.01, camera),
-    }
-    for controller in made.values():
-        controller.prepare(ab.Feedback(0.0))
-    made["predictive"].tests.fill_(1000)
-    made["predictive"].rate.assign([1.0, 1e-7, 1e-6, 1.0, 0.5])
-    times = medians(time_in_turn({name: controller.launch for name, controller in made.items()}, device))
-    for name, taken in times.items():
-        yield {"controller": name, "device": device.name, "objects": count, "select_ms": round(taken, 4)}

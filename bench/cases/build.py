@@ -16,34 +16,27 @@ from warp_abtree import testing
 from ..baselines.wp_bvh import FaceBvh
 from ..meshes import ModelFolder
 from ..shapes import knot
-from ..timing import fit_slope, summarise, time_call
+from ..timing import summarise, time_call
 
-FULL = {"faces": (200, 1000, 5000, 20_000, 60_000, 250_000, 1_000_000), "repeats": (5, 1)}
-QUICK = {"faces": (200, 600), "repeats": (2, 1)}
+FULL = {"faces": (200, 1000, 5000, 20_000, 60_000, 250_000, 1_000_000), "repeats": 5}
+QUICK = {"faces": (200, 600), "repeats": 2}
 LARGE = 100_000  # faces from which on a build is timed once
 BASE_FACES = 10
 BASELINE = "fast_simplification"
 
 
-def run(device, quick=False, largest=None, models=None):
-    """Yield one row a mesh, and one of the slopes of its lines.
+def run(device, quick=False, models=None):
+    """Yield one row a mesh.
 
     Times are those that one thread of the host ran, in turn with the baselines'; of the device only bvh_build, a wp.Bvh
-    over the boxes of the faces. all_cores is what a build takes from begin to end on all cores of the host.
+    over the boxes of the faces.
     """
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL
-    rows = []
     build(*knot(200), "")  # compiles what there is to compile
     with tempfile.TemporaryDirectory() as folder:
         for face_target in sizes["faces"]:
-            if face_target <= (largest or face_target):
-                rows.append(run_mesh(device, face_target, sizes, ModelFolder(models or folder)))
-                yield rows[-1]
-    row = {"case": "slope", "sizes": len(rows)}
-    for name in ("build_ms", "file_mib"):
-        row[f"{name}_slope"] = fit_slope([r["faces"] for r in rows], [r[name] for r in rows])
-    yield row
+            yield run_mesh(device, face_target, sizes["repeats"], ModelFolder(models or folder))
 
 
 def build(vertices, faces, name):
@@ -73,7 +66,7 @@ def find_simplifier(vertices, faces):
     return lambda: len(simplify(vertices, faces, **few)[1]), None
 
 
-def run_mesh(device, face_target, sizes, folder):
+def run_mesh(device, face_target, repeats, folder):
     """Return the row of one mesh."""
     gc.collect()
     vertices, faces = knot(face_target)
@@ -92,14 +85,10 @@ def run_mesh(device, face_target, sizes, folder):
     runs = {name: time_call(call, "cpu", time.thread_time) for name, call in calls.items()}
     clock = time.thread_time if device.is_cpu else time.perf_counter
     runs["bvh_build"] = time_call(FaceBvh(vertices, faces, device).rebuild, device, clock)
-    times, repeats = {}, sizes["repeats"][len(faces) > LARGE]
-    for _ in range(repeats):
-        found = build(vertices, faces, name)[1] if repeats > 1 else first
+    times = {}
+    for turn in range(1 if len(faces) > LARGE else repeats):
+        found = build(vertices, faces, name)[1] if turn else first
         for key, value in (found | {key: run() for key, run in runs.items()}).items():
             times.setdefault(key, []).append(value)
-    row |= summarise(times)
-    begin = time.perf_counter()
-    ab.Model.from_arrays(vertices, faces, base_faces=BASE_FACES, cache=False, certify=True)
-    row["all_cores_ms"] = round(1e3 * (time.perf_counter() - begin), 2)
-    row |= {f"{BASELINE}_reached": simplify()} if simplify else {f"{BASELINE}_skipped": skipped}
-    return row | {"file_mib": round(path.stat().st_size / 2**20, 2)}
+    row |= summarise(times) | {"file_mib": path.stat().st_size / 2**20}
+    return row | ({f"{BASELINE}_reached": simplify()} if simplify else {f"{BASELINE}_skipped": skipped})

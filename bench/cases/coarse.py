@@ -7,15 +7,12 @@ import warp as wp
 
 import warp_abtree as ab
 
-from ..baselines.wp_bvh import BvhPosed, find_constructor
-from ..shapes import knot, pair_poses, scene_of_pairs
+from ..baselines.wp_bvh import BvhPosed
+from ..shapes import KNOT_PAIRS, knot, knot_batches, pair_poses, scene_of_pairs
 from ..timing import ratio_of, summarise, time_in_turn
 
-FULL = {"faces": 5000, "pairs": (1, 64, 1024, 8192), "distances": (0.9, 0.2), "repeats": 15}
 QUICK = {"faces": 300, "pairs": (2,), "distances": (0.2,), "repeats": 3}
 FRACTIONS = (1.0, 0.1, 0.01)  # of the faces
-# More than these take minutes on the CPU, or where the meshes are nearer than this.
-PAIRS_MAX_CLOSE, PAIRS_MAX_CPU, FAR = 1024, 64, 0.9
 
 
 def run(device, quick=False):
@@ -24,31 +21,20 @@ def run(device, quick=False):
     faces are those active at the LOD; ratios are the baseline's times over ours, contact_ratio contacts over faces.
     """
     device = wp.get_device(device)
-    sizes = QUICK if quick else FULL
-    mesh = knot(sizes["faces"])
-    model = ab.Model.from_arrays(*mesh)
-    constructor = find_constructor(*mesh, pair_poses(min(64, max(sizes["pairs"])), FAR), device)
-    for pair_count in sizes["pairs"]:
-        for distance in sizes["distances"]:
-            limit = PAIRS_MAX_CPU if device.is_cpu else PAIRS_MAX_CLOSE if distance < FAR else max(sizes["pairs"])
-            for fraction in FRACTIONS if pair_count <= limit else ():
-                poses = pair_poses(pair_count, distance)
-                row = {"device": device.name, "pairs": pair_count, "distance": distance, "fraction": fraction}
-                yield row | run_batch(device, model, fraction, poses, constructor, sizes["repeats"])
+    sizes = QUICK if quick else KNOT_PAIRS
+    model = ab.Model.from_arrays(*knot(sizes["faces"]))
+    for pair_count, distance in knot_batches(device, sizes):
+        for fraction in FRACTIONS:
+            row = {"device": device.name, "pairs": pair_count, "distance": distance, "fraction": fraction}
+            poses = pair_poses(pair_count, distance)
+            yield row | run_batch(device, model, fraction, poses, sizes["repeats"])
 
 
-def mesh_at(model, lod):
-    """Return vertices and faces at an LOD, without vertices that no face has."""
-    vertices, faces, _ = model.mesh_at(lod)
-    used, faces = np.unique(faces, return_inverse=True)
-    return vertices[used], faces.reshape(-1, 3).astype(np.int32)
-
-
-def run_batch(device, model, fraction, poses, constructor, repeats):
+def run_batch(device, model, fraction, poses, repeats):
     """Return the columns of one batch of pairs at one LOD."""
     gc.collect()  # scenes and their queries hold each other
     lod = model.lod_max if fraction == 1 else model.lod_for(fraction=fraction)
-    mesh = mesh_at(model, lod)
+    mesh = model.mesh_at(lod)[:2]
     scene, pairs = scene_of_pairs(device, model, poses)
     scene.set_lods(np.full(scene.object_count, lod))
     queries = {output: ab.Query(scene, output, pairs=pairs) for output in ("faces", "any")}
@@ -58,10 +44,11 @@ def run_batch(device, model, fraction, poses, constructor, repeats):
     if not np.array_equal(found["any"].any, found["faces"].count > 0) or len(found["contacts"].contacts) != hits:
         raise RuntimeError("the outputs disagree")
     launches = {output: query.launch for output, query in queries.items()}
-    launches["peer_faces"] = BvhPosed(*mesh, poses, 2 * hits + 1024, device, constructor).launch
-    launches["peer_any"] = BvhPosed(*mesh, poses, None, device, constructor).launch
+    baseline = BvhPosed(*mesh, poses, 2 * hits + 1024, device)
+    launches["peer_faces"] = baseline.launch
+    launches["peer_any"] = BvhPosed(*mesh, poses, None, device, baseline.constructor).launch
     times = time_in_turn(launches, device, repeats)
-    row = {"faces": len(mesh[1]), "hits": hits, "node_tests": int(found["faces"].node_tests.sum())}
-    row |= {"peer": f"wp.Bvh {constructor}"} | summarise(times)
+    row = {"faces": len(mesh[1]), "hits": hits, "node_tests": found["faces"].node_tests.sum()}
+    row |= {"peer": f"wp.Bvh {baseline.constructor}"} | summarise(times)
     row |= {f"{output}_ratio": ratio_of(times[f"peer_{output}"], times[output]) for output in ("faces", "any")}
     return row | {"contact_ratio": ratio_of(times["contacts"], times["faces"])}

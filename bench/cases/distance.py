@@ -1,12 +1,11 @@
 """Least distances: real meshes at gaps, a nut free on its bolt, and knots at random poses; python-fcl beside them.
 
 Gaps are fractions of the mesh's size, poses otherwise random. Times are of a pose: of all poses at once, where each
-search starts anew (fresh) or from the faces of the launch before (again), and of one pair alone, searched anew, by
-launches from Python (one) and as a captured graph (one_graph, on the CPU; on CUDA all are); on the CPU also of one pair
-that is brought from pose to pose, each a call of `Scene.set_poses` and `DistanceQuery.run` (calls). On the CPU all on
-one core, beside python-fcl, whose answers must be ours but for rounding.
+search starts anew (fresh) or from the faces of the launch before (again); on the CPU also of one pair that is brought
+from pose to pose, each a call of `Scene.set_poses` and `DistanceQuery.run` (calls). On the CPU all on one core, beside
+python-fcl, whose answers must be ours but for rounding.
 
-The part `gap` is contacts with a gap: `bench.gap_contacts`.
+The part `gap` is contacts with a gap beside contacts without, of knots: times by gap, and how many more.
 """
 
 import time
@@ -15,32 +14,38 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
-from warp_abtree import testing
 
-from .. import gap_contacts
+from .. import shapes
 from ..baselines.fcl import Fcl
 from ..meshes import ModelFolder, knot_model, mesh_file
-from ..shapes import longest_side, place_at_gaps, pose_matrices, random_poses, scene_of_poses
-from ..timing import make_replay, medians, no_garbage_collection, one_core, time_in_turn
+from ..timing import medians, no_garbage_collection, one_core, ratio_of, time_in_turn
 from .assembly import place_nut
 
 FULL = {"poses": 32, "counts": (1, 1024, 65536), "knot": 5000, "repeats": 7}
 CPU = FULL | {"counts": (1, 1024)}
 QUICK = {"poses": 3, "counts": (3,), "knot": 300, "repeats": 1}
+GAP_FULL = shapes.KNOT_PAIRS | {"pairs": (64, 1024, 8192)}
+GAP_QUICK = {"faces": 300, "pairs": (4,), "distances": (0.2,), "repeats": 2}
+GAPS = 0.0, 1e-4, 3e-4, 1e-3, 3e-3  # of the mesh's size
 PARTS = ("nearest", "gap")
-IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 MESHES = ("cow", "rocker-arm", "stanford-bunny")
 NUT = ("factory-bolt-m20", "factory-nut-m20")
-BASES = ("fresh", "fcl"), ("again", "fcl"), ("calls", "fcl"), ("one", "fcl_one"), ("one_graph", "fcl_one")
-LAUNCHES_BEFORE = 20  # of the pair alone, as in a loop that goes on: slabs are made of what is asked often
 
 
 def run(device, quick=False, only=PARTS):
-    """Yield a row a workload: times [ms] and what the searches took; of baselines, where they are at hand."""
+    """Yield a row a workload: times [ms] and what the searches took; of baselines, where they are at hand.
+
+    Of the part `gap` a row a number of pairs, distance of their centres, and gap: more is contacts over those without a
+    gap, ratio the time over that without one.
+    """
+    device = wp.get_device(device)
     if "nearest" in only:
-        yield from measure_all(wp.get_device(device), quick)
+        yield from measure_all(device, quick)
     if "gap" in only:
-        yield from gap_contacts.run(device, quick)
+        sizes = GAP_QUICK if quick else GAP_FULL
+        knots = knot_model(sizes["faces"])
+        for count, distance in shapes.knot_batches(device, sizes):
+            yield from time_gaps(device, knots, count, distance, sizes["repeats"])
 
 
 def measure_all(device, quick):
@@ -50,70 +55,44 @@ def measure_all(device, quick):
     at_hand = [name for name in MESHES if mesh_file(name)]
     for name in at_hand[:1] if quick else at_hand:
         model = folder.load([name])
-        yield measure(name, [model, model], place_at_gaps(model, sizes["poses"]), device, sizes["repeats"])
+        yield measure(name, [model, model], shapes.place_at_gaps(model, sizes["poses"]), device, sizes["repeats"])
     if all(map(mesh_file, NUT)) and not quick:
         models = [folder.load([name]) for name in NUT]
         matrices = place_nut(models, sizes["poses"])["free"]
         yield measure("nut on bolt, free", models, matrices, device, sizes["repeats"])
     knots = knot_model(sizes["knot"])
     for count in sizes["counts"]:
-        matrices = pose_matrices(random_poses(longest_side(knots), count))
+        matrices = shapes.pose_matrices(shapes.random_poses(shapes.longest_side(knots), count))
         yield measure(f"knot, {count} poses", [knots, knots], matrices, device, sizes["repeats"])
 
 
 def measure(name, models, matrices, device, repeats):
-    """Return the row of one workload.
-
-    Raises:
-        RuntimeError: A baseline's distance is another, by more than float64's rounding of the sizes.
-    """
-    scene, pairs = scene_of_poses(device, *models, [IDENTITY] * len(matrices))
-    scene.set_poses(np.concatenate([np.eye(4)[None], matrices]))
+    """Return the row of one workload."""
+    scene, pairs = shapes.scene_of_poses(device, *models, matrices)
     query, fresh = ab.DistanceQuery(scene, pairs), ab.DistanceQuery(scene, pairs)
-    middle = slice(len(pairs) // 2, len(pairs) // 2 + 1)
-    one = ab.DistanceQuery(scene, pairs[middle])
     found = fresh.run()
     query.run()
-    for _ in range(LAUNCHES_BEFORE):
-        one.launch()
     row = {"device": device.name, "workload": name, "faces": " x ".join(str(model.face_count) for model in models)}
-    row |= {"poses": len(pairs), "meet": int(found.any.sum()), "median_gap": float(np.median(found.distance))}
-    row |= {"node_tests": round(found.node_tests.mean(), 1), "face_tests": round(found.triangle_tests.mean(), 1)}
-
-    def launch_fresh():
-        fresh.forget()
-        fresh.launch()
-
-    def launch_one():
-        one.forget()
-        one.launch()
-
-    with one_core(), testing.regime(cpu_threads=1):
-        # Either comes after a whole batch: what it needs is as far from the core.
-        launches = {"fresh": launch_fresh}
-        if device.is_cpu:
-            launches["one_graph"] = make_replay(launch_one, device, captured=True)
-        launches |= {"again": query.launch, "one": launch_one}
+    row |= {"poses": len(pairs), "meet": found.any.sum(), "median_gap": np.median(found.distance)}
+    row |= {"node_tests": found.node_tests.mean(), "face_tests": found.triangle_tests.mean()}
+    launches = {"fresh": lambda: (fresh.forget(), fresh.launch()), "again": query.launch}
+    with one_core():
         if device.is_cpu:
             launches["calls"] = make_calls(models, matrices, device)
             try:
-                fcl = make_fcl(models, matrices, found, row)
-                launches |= {"fcl": fcl.distances, "fcl_one": lambda: fcl.distances(middle)}
+                launches["fcl"] = make_fcl(models, matrices, found, row).distances
             except ImportError as error:
                 row["fcl_skipped"] = str(error)
         with no_garbage_collection():
             times = medians(time_in_turn(launches, device, repeats, time.thread_time))
-    per = {key: time if "one" in key else time / len(pairs) for key, time in times.items()}
-    row |= {f"{key}_ms": float(f"{value:.4g}") for key, value in per.items()}
-    for key, base in BASES:
-        if base in per:
-            row[f"{key}_fcl_ratio"] = round(per[base] / per[key], 2)
-    return row
+    row |= {f"{key}_ms": value / len(pairs) for key, value in times.items()}
+    ours = [key for key in times if key != "fcl"] if "fcl" in times else []
+    return row | {f"{key}_fcl_ratio": round(times["fcl"] / times[key], 2) for key in ours}
 
 
 def make_calls(models, matrices, device):
     """Return a callable that brings one pair from pose to pose, and reads its distance at each."""
-    scene, pairs = scene_of_poses(device, *models, [IDENTITY])
+    scene, pairs = shapes.scene_of_poses(device, *models, matrices[:1])
     query = ab.DistanceQuery(scene, pairs)
     poses = [np.stack([np.eye(4), matrix]) for matrix in matrices]
 
@@ -127,13 +106,37 @@ def make_calls(models, matrices, device):
 
 
 def make_fcl(models, matrices, found, row):
-    """Return python-fcl, after comparing its distances with ours."""
+    """Return python-fcl; raise a RuntimeError where its distances differ from ours by more than float64's rounding."""
     meshes = [model.mesh_at(model.lod_max)[:2] for model in models]
     fcl = Fcl(*meshes, matrices)
     apart = ~found.any
     error = np.abs(fcl.distances() - found.distance)[apart].max(initial=0.0)
-    size = max(longest_side(model) for model in models)
+    size = max(shapes.longest_side(model) for model in models)
     if error > 1e-12 * size:
         raise RuntimeError(f"python-fcl's distances differ by {error / size} of the size")
-    row["fcl_differs"] = float(f"{error / size:.2g}")
+    row["fcl_differs"] = error / size
     return fcl
+
+
+def time_gaps(device, model, count, distance, repeats):
+    """Yield the rows of one batch; raise a RuntimeError where what intersects is not the same with a gap."""
+    scene, pairs = shapes.scene_of_pairs(device, model, shapes.pair_poses(count, distance))
+    plain = scene.intersect(pairs, output="contacts")
+    queries, found = {}, {}
+    for gap in (None, *GAPS):
+        asked = None if gap is None else gap * shapes.longest_side(model)
+        result = scene.intersect(pairs, output="contacts", gap=asked)
+        rows = result.contacts if gap is None else result.contacts[result.contacts["separation"] < 0]
+        if rows["faces"].tobytes() != plain.contacts["faces"].tobytes():
+            raise RuntimeError("with a gap other faces intersect")
+        found[gap] = len(result.contacts)
+        queries[gap] = ab.ContactQuery(scene, pairs, capacity=max(1, found[gap]), gap=asked)
+        queries[gap].grow()
+    with one_core(), no_garbage_collection():
+        clock = [time.thread_time] if device.is_cpu else []
+        times = time_in_turn({gap: query.launch for gap, query in queries.items()}, device, repeats, *clock)
+    middle = medians(times)
+    for gap in GAPS:
+        row = {"device": device.name, "pairs": count, "distance": distance, "gap": gap, "contacts": found[gap]}
+        row |= {"more": found[gap] / max(1, found[None]), "without_ms": middle[None], "with_ms": middle[gap]}
+        yield row | {"ratio": ratio_of(times[gap], times[None]), "meet": np.count_nonzero(plain.any)}

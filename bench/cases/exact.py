@@ -13,15 +13,8 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
-from warp_abtree.testing import (
-    EXACT,
-    FILTER,
-    FLOAT32,
-    FLOAT32_UNIT,
-    UNCERTAIN,
-    decide_triangles,
-    float32_filter_triangles,
-)
+from warp_abtree import testing
+from warp_abtree.testing import EXACT, FILTER, FLOAT32, UNCERTAIN
 
 from ..shapes import knot, pair_poses, scene_of_pairs
 from ..timing import ratio_of, summarise, time_in_turn
@@ -36,19 +29,14 @@ COUNT, QUICK_COUNT = 100_000, 110
 CHUNK = 20_000
 # Every so many adversarial pairs, one is asked in all orders; the others in one order each, in turn.
 WHOLE_EVERY = 64
-ORDERS = [
-    (p, q, swap) for p in itertools.permutations(range(3)) for q in itertools.permutations(range(3)) for swap in (0, 1)
-]
+ORDERS = list(itertools.product(itertools.permutations(range(3)), itertools.permutations(range(3)), (0, 1)))
 STAGES = ("float32_stage_ns", "float64_stage_ns", "exact_stage_ns", "float32_ns")
 
 
-def run(device, count=None, processes=2, quick=False):
+def run(device, count=None, quick=False):
     """Yield one row a kind of pair: pairs asked, fraction that intersect (meet), disagreements of any stage with the
     truth, fractions left to float64 and to exact signs, error rate of float32 alone, time a pair [ns]; then one a
-    scene of meshes.
-
-    Raises:
-        RuntimeError: An answer was wrong, or the tests' oracle is not at hand.
+    scene of meshes. Raise a RuntimeError where an answer was wrong, or the tests' oracle is not at hand.
     """
     device = wp.get_device(device)
     if load_oracle() is None:
@@ -58,7 +46,7 @@ def run(device, count=None, processes=2, quick=False):
     for mode in (FILTER, EXACT, FLOAT32):
         ask(mode, one, device)
     jobs, wrong = list_jobs(count or (QUICK_COUNT if quick else COUNT)), 0
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+    with multiprocessing.get_context("spawn").Pool(1 if quick else None) as pool:
         chunks = zip(jobs, pool.imap(find_truth, jobs), strict=True)
         for kind, group in itertools.groupby(chunks, key=lambda chunk: chunk[0][0]):
             tally = sum(check_chunk(job, truth, device) for job, truth in group)
@@ -83,9 +71,8 @@ def measure_meshes(device, sizes):
         times = time_in_turn({p: query.launch for p, query in queries.items()}, device, sizes["repeats"])
         exact = found["exact"]
         tests = exact.triangle_tests.sum()
-        row = {"device": device.name, "scene": name, "hits": len(exact.faces), "triangle_tests": int(tests)}
-        row["to_float64"] = float(f"{exact.float64_tests.sum() / tests:.3g}")
-        row["to_exact"] = float(f"{exact.exact_tests.sum() / tests:.3g}")
+        row = {"device": device.name, "scene": name, "hits": len(exact.faces), "triangle_tests": tests}
+        row |= {"to_float64": exact.float64_tests.sum() / tests, "to_exact": exact.exact_tests.sum() / tests}
         row["float32_missed"], row["float32_invented"] = count_differences(found["float32"].faces, exact.faces)
         row |= summarise(times)
         yield row | {"exact_to_float32": ratio_of(times["exact"], times["float32"])}
@@ -118,11 +105,9 @@ def reorder_pairs(pairs):
     whole = np.repeat(rows[::WHOLE_EVERY], len(ORDERS))
     order = np.concatenate([rows % len(ORDERS), np.arange(len(whole)) % len(ORDERS)])
     rows = np.concatenate([rows, whole])
-    reordered = np.empty((len(rows), 2, 3, 3))
-    for k, (p, q, swap) in enumerate(ORDERS):
-        chosen = order == k
-        reordered[chosen, swap] = pairs[rows[chosen], 0][:, p]
-        reordered[chosen, 1 - swap] = pairs[rows[chosen], 1][:, q]
+    first, second, swap = (np.array(part)[order] for part in zip(*ORDERS))
+    reordered = np.stack([pairs[rows[:, None], 0, first], pairs[rows[:, None], 1, second]], 1)
+    reordered[swap == 1] = reordered[swap == 1, ::-1]
     return reordered, rows
 
 
@@ -133,7 +118,7 @@ def pair_test(mode):
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def test_pair_kernel(corners: wp.array2d(dtype=wp.vec3d), answer_out: wp.array(dtype=wp.int32)):
         i = wp.tid()
-        answer_out[i] = decide_triangles(
+        answer_out[i] = testing.decide_triangles(
             wp.static(mode), corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
         )
 
@@ -145,7 +130,7 @@ def float32_pair_kernel(
     error: wp.float32, unit: wp.float32, corners: wp.array2d(dtype=wp.vec3), answer_out: wp.array(dtype=wp.int32)
 ):
     i = wp.tid()
-    answer_out[i] = float32_filter_triangles(
+    answer_out[i] = testing.float32_filter_triangles(
         error, unit, corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
     )
 
@@ -171,7 +156,7 @@ def ask(mode, pairs, device):
 def ask_float32(pairs, device, proven=True):
     """Return the answers of the float32 stage, with its bound or without, and the time [s]."""
     # Coordinates of at most 1 are off by at most 2^-25, differences by twice as much.
-    bound = [1.02 * 2.0**-24, float(FLOAT32_UNIT)] if proven else [0.0, 0.0]
+    bound = [1.02 * 2.0**-24, float(testing.FLOAT32_UNIT)] if proven else [0.0, 0.0]
     return time_launch(float32_pair_kernel, bound, unit_size(pairs).astype(np.float32), wp.vec3, device)
 
 
@@ -214,5 +199,5 @@ def describe_tally(device, kind, tally):
     pairs, hits, wrong, to_float64, to_exact, unproven, *times = tally.tolist()
     shares = {"meet": hits, "to_float64": to_float64, "to_exact": to_exact, "float32_errors": unproven}
     row = {"device": device.name, "kind": kind, "pairs": int(pairs), "disagreements": int(wrong)}
-    row |= {name: float(f"{count / pairs:.3g}") for name, count in shares.items()}
-    return row | {name: round(1e9 * t / pairs, 1) for name, t in zip(STAGES, times, strict=True)}
+    row |= {name: count / pairs for name, count in shares.items()}
+    return row | {name: 1e9 * t / pairs for name, t in zip(STAGES, times, strict=True)}

@@ -7,48 +7,37 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
-from warp_abtree import testing
 
 from ..baselines.newton import make_newton
-from ..baselines.wp_bvh import BvhPosed, find_constructor
+from ..baselines.wp_bvh import BvhPosed
 from ..memory import memory_columns
-from ..roofline import COUNTERS, find_peaks, roofline
-from ..shapes import knot, pair_poses, scene_of_pairs
-from ..timing import ratio_of, summarise, time_call, time_in_turn, time_rounds
+from ..shapes import KNOT_PAIRS, knot, knot_batches, pair_poses, scene_of_pairs
+from ..timing import ratio_of, summarise, time_in_turn
 from ..verify import count_differences, judge_disputed
 
-FULL = {"faces": 5000, "pairs": (1, 64, 1024, 8192), "distances": (0.9, 0.2), "repeats": 15}
 QUICK = {"faces": 300, "pairs": (1, 4), "distances": (0.2,), "repeats": 3}
-# More than these take minutes on the CPU, or where the meshes are nearer than this.
-PAIRS_MAX_CLOSE = 1024
-FAR = 0.9
 NEWTON_PAIRS_MAX = {"cuda": 1024, "cpu": 64}
+COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 JUDGED = 300  # face pairs that the oracle decides
 
 
 def run(device, quick=False):
-    """Yield one row a case: what was asked and found, times of ours and of each baseline, memory and the roofline.
+    """Yield one row a case: what was asked and found, times of ours and of each baseline, and memory.
 
-    Columns: first_s is the first run, which compiles and grows buffers. ours and peer (wp.Bvh) are launches, result and
-    peer_result the time to bring face pairs to the host and sort them there. On the CPU ours has all cores; one_core
-    and one_core_ratio are of both on one. judged says how many face pairs on which the peer differs the exact oracle
-    decided, ours_wrong in how many it sides with the peer. Memory is that of scene and query, before the baselines.
+    Columns: first_s is the first run, which compiles and grows buffers. ours and peer (wp.Bvh) are launches. judged
+    says how many face pairs on which the peer differs the exact oracle decided, ours_wrong in how many it sides with
+    the peer. Memory is that of scene and query, before the baselines.
     """
     device = wp.get_device(device)
-    sizes = QUICK if quick else FULL
+    sizes = QUICK if quick else KNOT_PAIRS
     mesh = knot(sizes["faces"])
     model = ab.Model.from_arrays(*mesh, name=f"knot {len(mesh[1]):,}")
-    constructor = find_constructor(*mesh, pair_poses(min(64, max(sizes["pairs"])), 0.9), device)
-    for pair_count in sizes["pairs"]:
-        for distance in sizes["distances"]:
-            limit = PAIRS_MAX_CLOSE if device.is_cpu or distance < FAR else max(sizes["pairs"])
-            if pair_count <= limit:
-                poses = pair_poses(pair_count, distance)
-                row = run_batch(device, model, mesh, poses, constructor, sizes["repeats"])
-                yield {"distance": distance} | row
+    for pair_count, distance in knot_batches(device, sizes):
+        poses = pair_poses(pair_count, distance)
+        yield {"distance": distance} | run_batch(device, model, mesh, poses, sizes["repeats"])
 
 
-def run_batch(device, model, mesh, poses, constructor, repeats):
+def run_batch(device, model, mesh, poses, repeats):
     """Return the row of one batch of pairs."""
     gc.collect()  # scenes and their queries hold each other
     scene, pairs = scene_of_pairs(device, model, poses)
@@ -57,10 +46,10 @@ def run_batch(device, model, mesh, poses, constructor, repeats):
     first = time.perf_counter() - begin
     query = ab.Query(scene, output="faces", pairs=pairs, capacity=max(1, len(whole.faces)))
     memory = memory_columns(scene, query)
-    baseline = BvhPosed(*mesh, poses, 4 * len(whole.faces) + 1024, device, constructor)
+    baseline = BvhPosed(*mesh, poses, 4 * len(whole.faces) + 1024, device)
     row = {"device": device.name, "faces": len(mesh[1]), "pairs": len(pairs), "hits": len(whole.faces)}
-    row |= {name: int(getattr(whole, name).sum(dtype=np.int64)) for name in COUNTERS}
-    row |= {"first_s": round(first, 3), "peer": f"wp.Bvh {constructor}"}
+    row |= {name: getattr(whole, name).sum(dtype=np.int64) for name in COUNTERS}
+    row |= {"first_s": first, "peer": f"wp.Bvh {baseline.constructor}"}
     newton, skipped = {}, {"newton": "more pairs take minutes"}
     if len(pairs) <= NEWTON_PAIRS_MAX["cuda" if device.is_cuda else "cpu"]:
         newton, skipped = make_newton(*mesh, poses, len(whole.faces), device)
@@ -75,15 +64,8 @@ def run_batch(device, model, mesh, poses, constructor, repeats):
     for name, other in newton.items():
         row |= {f"{name}_{key}": value for key, value in other.compare(whole.any).items()}
         row[f"{name}_ratio"] = ratio_of(times[name], times["ours"])
-    if device.is_cpu:
-        launches = {"one_core": query.launch, "peer_one_core": baseline.launch}
-        with testing.regime(cpu_threads=1):
-            times = time_in_turn(launches, device, repeats, time.thread_time)
-        row |= summarise(times) | {"one_core_ratio": ratio_of(times["peer_one_core"], times["one_core"])}
     row |= {f"{name}_skipped": why for name, why in skipped.items()}
-    runs = {"result": time_call(query.result, device), "peer_result": time_call(baseline.result, device)}
-    row |= summarise(time_rounds(runs, min(repeats, 3)))
-    return row | memory | roofline(again, row["ours_ms"], find_peaks(device))
+    return row | memory | {"node_tests_per_s": 1e3 * row["node_tests"] / row["ours_ms"]}
 
 
 def check_baseline(found, ours, model, poses):

@@ -8,25 +8,23 @@ import warp as wp
 
 import warp_abtree as ab
 
-from ..baselines.wp_bvh import BvhPosed, find_constructor
+from ..baselines.wp_bvh import BvhPosed
 from ..memory import memory_columns
-from ..meshes import knot_model
+from ..meshes import ModelFolder
 from ..shapes import longest_side, pair_poses, random_poses, scene_of_objects
 from ..timing import fit_slope, ratio_of, summarise, time_in_turn, upper_half
 
-SIZES = {
-    "cuda": {
-        "pairs": {"faces": 5000, "counts": (1, 10, 100, 1000, 10_000, 100_000)},
-        "faces": {"sizes": (200, 1000, 5000, 20_000, 100_000, 250_000, 1_000_000), "pairs": (1, 64)},
-        "worlds": {"faces": 1000, "counts": (1, 4, 16, 64, 256, 1024, 4096, 16_384)},
-        "repeats": 11,
-    },
-    "cpu": {
-        "pairs": {"faces": 500, "counts": (1, 10, 100, 1000, 10_000)},
-        "faces": {"sizes": (200, 1000, 5000, 20_000, 60_000, 250_000, 1_000_000), "pairs": (1, 64)},
-        "worlds": {"faces": 500, "counts": (1, 4, 16, 64, 256, 1024)},
-        "repeats": 5,
-    },
+CUDA = {
+    "pairs": {"faces": 5000, "counts": (1, 10, 100, 1000, 10_000, 100_000)},
+    "faces": {"sizes": (200, 1000, 5000, 20_000, 100_000, 250_000, 1_000_000), "pairs": (1, 64)},
+    "worlds": {"faces": 1000, "counts": (1, 4, 16, 64, 256, 1024, 4096, 16_384)},
+    "repeats": 11,
+}
+CPU = {
+    "pairs": {"faces": 500, "counts": (1, 10, 100, 1000, 10_000)},
+    "faces": {"sizes": (200, 1000, 5000, 20_000, 60_000), "pairs": (1, 64)},
+    "worlds": {"faces": 500, "counts": (1, 4, 16, 64, 256, 1024)},
+    "repeats": 5,
 }
 QUICK = {
     "pairs": {"faces": 200, "counts": (1, 4, 16)},
@@ -34,49 +32,41 @@ QUICK = {
     "worlds": {"faces": 200, "counts": (1, 8)},
     "repeats": 2,
 }
-LARGEST_CPU = 60_000  # unless more is asked for
 DISTANCE = 0.9
 OBJECTS = 4  # a world
-TUNED = 64  # pairs that the baseline's tree is chosen for
 CHECKED = 3  # pairs and worlds asked again by themselves, where other numbers of warps work on each
 
 
-def run(device, quick=False, largest=None, models=None):
+def run(device, quick=False, models=None):
     """Yield one row a size, and after each sweep one with the slopes of its lines, all sizes and the upper half.
 
     build_s is the time to make scene and query, first_s that of the first run, which compiles and grows buffers. Memory
     is that of scene and query, before there is a baseline. broad is the broad phase of worlds alone.
     """
     device = wp.get_device(device)
-    sizes = QUICK if quick else SIZES["cuda" if device.is_cuda else "cpu"]
-    repeats, model, rows = sizes["repeats"], knot_model(sizes["pairs"]["faces"], models), []
-    for count in sizes["pairs"]["counts"]:
-        rows.append({"sweep": "pairs"} | run_pairs(device, model, count, repeats))
-        yield rows[-1]
-    yield describe_slope("pairs", rows)
-    rows, limit = [], largest or (LARGEST_CPU if device.is_cpu else max(sizes["faces"]["sizes"]))
-    for face_target in [size for size in sizes["faces"]["sizes"] if size <= limit]:
-        model = knot_model(face_target, models)
-        for count in sizes["faces"]["pairs"]:
-            rows.append({"sweep": "faces"} | run_pairs(device, model, count, repeats))
-            yield rows[-1]
+    sizes = QUICK if quick else CUDA if device.is_cuda else CPU
+    repeats, folder = sizes["repeats"], ModelFolder(models)
+    model = folder.load([f"knot:{sizes['pairs']['faces']}"])
+    yield from with_slopes("pairs", (run_pairs(device, model, n, repeats) for n in sizes["pairs"]["counts"]))
+    meshes = [folder.load([f"knot:{faces}"]) for faces in sizes["faces"]["sizes"]]
     for count in sizes["faces"]["pairs"]:
-        yield describe_slope("faces", [row for row in rows if row["pairs"] == count]) | {"pairs": count}
-    model, rows = knot_model(sizes["worlds"]["faces"], models), []
-    for count in sizes["worlds"]["counts"]:
-        rows.append({"sweep": "worlds"} | run_worlds(device, model, count, repeats))
+        yield from with_slopes("faces", (run_pairs(device, mesh, count, repeats) for mesh in meshes))
+    model = folder.load([f"knot:{sizes['worlds']['faces']}"])
+    yield from with_slopes("worlds", (run_worlds(device, model, n, repeats) for n in sizes["worlds"]["counts"]))
+
+
+def with_slopes(sweep, found):
+    """Yield the rows of a sweep as they come, and one of the slopes of its lines."""
+    rows = []
+    for row in found:
+        rows.append({"sweep": sweep} | row)
         yield rows[-1]
-    yield describe_slope("worlds", rows)
-
-
-def describe_slope(sweep, rows) -> dict:
-    """Return the row of a sweep's slopes."""
-    row = {"sweep": f"{sweep}: slope", "sizes": len(rows)}
+    row = {"sweep": f"{sweep}: slope", "sizes": len(rows), "pairs": rows[0]["pairs"]}
     for name in ("ours_ms", "peer_ms", "broad_ms", "arrays_mib", "pool_mib"):
-        if rows and name in rows[0]:
+        if name in rows[0]:
             for label, some in ((f"{name}_slope", rows), (f"{name}_slope_upper", upper_half(rows))):
                 row[label] = fit_slope([r[sweep] for r in some], [r[name] for r in some])
-    return row
+    yield row
 
 
 def make_query(device, model, poses, pairs=None, world_size=None):
@@ -88,7 +78,7 @@ def make_query(device, model, poses, pairs=None, world_size=None):
     made = time.perf_counter()
     result = query.run()
     row = {"device": device.name, "faces": model.face_count, "pairs": len(result.pairs), "hits": len(result.faces)}
-    row |= {"build_s": round(made - begin, 3), "first_s": round(time.perf_counter() - made, 3)}
+    row |= {"build_s": made - begin, "first_s": time.perf_counter() - made}
     return scene, query, result, row | memory_columns(scene, query)
 
 
@@ -98,12 +88,10 @@ def run_pairs(device, model, pair_count, repeats):
     scene, query, result, row = make_query(device, model, poses, pairs)
     for pair in range(0, pair_count, max(1, pair_count // CHECKED)):
         check_alone(scene, result, pairs[pair : pair + 1])
-    vertices, faces, _ = model.mesh_at(model.lod_max)
-    constructor = find_constructor(vertices, faces, poses[: 2 * TUNED], device)
-    baseline = BvhPosed(vertices, faces, poses, 2 * len(result.faces) + 1024, device, constructor)
+    baseline = BvhPosed(*model.mesh_at(model.lod_max)[:2], poses, 2 * len(result.faces) + 1024, device)
     times = time_query(query, {"peer": baseline.launch}, result, repeats)
     row |= summarise(times) | {"ratio": ratio_of(times["peer"], times["ours"])}
-    return row | {"peer": f"wp.Bvh {constructor}", "us_a_pair": round(1e3 * row["ours_ms"] / pair_count, 3)}
+    return row | {"peer": f"wp.Bvh {baseline.constructor}"}
 
 
 def time_query(query, others, result, repeats):

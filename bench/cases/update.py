@@ -17,32 +17,29 @@ from warp_abtree.testing import full_refit_fraction, read_bits, state_lods, uplo
 from ..baselines.wp_bvh import FaceBvh
 from ..memory import memory_columns
 from ..meshes import knot_model
-from ..timing import WARM_UP, crossover, fit_slope, make_runs, ratio_of, summarise, time_call, time_in_turn, time_rounds
+from ..timing import make_runs, ratio_of, summarise, time_call, time_in_turn, time_rounds
 
 # Fractions of the splits between the finest LOD and the other.
 FRACTIONS = (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.5, 0.9)
 FULL = {"faces": (4000, 16000, 64000, 250_000, 1_000_000), "states": (1, 16, 256, 4096), "state_faces": 500}
 FULL |= {"fractions": FRACTIONS, "repeats": 7}
+CPU = FULL | {"faces": (4000, 16000, 64000)}
 QUICK = {"faces": (200, 600), "fractions": (0.01, 0.1, 0.9), "states": (1, 12), "state_faces": 200, "repeats": 2}
-LARGEST_CPU = 64000
 STATES_PER_MODEL = 8
 REFITS = {"update": False, "full": True}  # whether states are refitted whole
-ROUND_TRIPS = 2  # times there and back, the last of which counts
 
 
-def run(device, quick=False, largest=None, models=None):
-    """Yield one row a fraction of a mesh, one a mesh with its crossover, and one a number of states moved at once.
+def run(device, quick=False, models=None):
+    """Yield one row a fraction of a mesh, and one a number of states moved at once.
 
     Columns: nodes are those of the partial update, counted; entries are the faces of the slice between the LODs,
     repeats included; full tells whether the library would refit the whole tree. bvh_build boxes the faces at the LOD
-    and builds a wp.Bvh over them. For crossover_* see `find_crossover`.
+    and builds a wp.Bvh over them.
     """
     device = wp.get_device(device)
-    sizes = QUICK if quick else FULL
-    limit = largest or (LARGEST_CPU if device.is_cpu else max(sizes["faces"]))
+    sizes = QUICK if quick else CPU if device.is_cpu else FULL
     for face_target in sizes["faces"]:
-        if face_target <= limit:
-            yield from run_mesh(device, knot_model(face_target, models), sizes)
+        yield from run_mesh(device, knot_model(face_target, models), sizes)
     for count in sizes["states"]:
         yield run_states(device, knot_model(sizes["state_faces"], models), count, sizes["repeats"])
 
@@ -58,10 +55,8 @@ def same_bits(one, other) -> bool:
 
 def check_update(scene, there, back, faces):
     """Move to other LODs and back by both kinds of refit and compare all bits; return k and nodes refitted of each
-    state by the partial update, faces in its slices, and by kind of refit the launches that repeat both updates.
-
-    Raises:
-        RuntimeError: Bits or k differ, the bound of equation (1) is passed, or states have changed places.
+    state by the partial update, faces in its slices, and by kind of refit the launches that repeat both updates. Raise
+    a RuntimeError where bits or k differ, the bound of equation (1) is passed, or states have changed places.
     """
     begin, start = state_lods(scene), read_bits(scene)
     launches, bits, counts = {}, {}, {}
@@ -98,15 +93,13 @@ def measure_update(scene, there, back, faces, repeats):
     device = scene.device
     k, nodes, entries, launches = check_update(scene, there, back, faces)
     bound = int(sum(bound_nodes(int(each), faces) for each in k))
-    row = {"device": device.name, "faces": faces, "states": len(k), "k": int(k.sum()), "entries": entries}
-    row |= {"nodes_refitted": int(nodes.sum()), "bound": bound}
+    row = {"device": device.name, "faces": faces, "states": len(k), "k": k.sum(), "entries": entries}
+    row |= {"nodes_refitted": nodes.sum(), "bound": bound}
     ways = {(kind, way): launch for kind, both in launches.items() for way, launch in enumerate(both)}
     runs = make_runs(ways, device)
-    times = {kind: [] for kind in REFITS}
-    for turn in range(WARM_UP + repeats):
-        for kind in REFITS:
-            taken = [[runs[kind, way]() for way in (0, 1)] for _ in range(ROUND_TRIPS)]
-            times[kind] += taken[-1] if turn >= WARM_UP else []
+    turns = {(kind, trip, way): runs[kind, way] for kind in REFITS for trip in (0, 1) for way in (0, 1)}
+    taken = time_rounds(turns, repeats)
+    times = {kind: taken[kind, 1, 0] + taken[kind, 1, 1] for kind in REFITS}
     upload_lods(scene)
     calls = {"there": lambda: scene.set_lods(there), "back": lambda: scene.set_lods(back)}
     walls = time_rounds({way: time_call(call, device) for way, call in calls.items()}, repeats)
@@ -114,17 +107,11 @@ def measure_update(scene, there, back, faces, repeats):
     return row | {"ratio": ratio_of(times["full"], times["update"])}
 
 
-def find_crossover(rows, column):
-    """Return where in a column an update starts to cost as much as a full refit: the least if always, None if never."""
-    x = [row[column] for row in rows]
-    return crossover(x, [math.log(row["update_ms"] / row["full_ms"]) for row in rows], x[0])
-
-
 def run_mesh(device, model, sizes):
-    """Yield the rows of one mesh."""
+    """Yield the rows of one mesh, a fraction each."""
     scene = ab.Scene(device=device)
     scene.add(model)
-    finest, repeats, rows = model.lod_max, sizes["repeats"], []
+    finest, repeats = model.lod_max, sizes["repeats"]
     memory = memory_columns(scene)
     for step in sorted({max(1, round(fraction * finest)) for fraction in sizes["fractions"]}):
         row = {"case": "one state", "splits": step}
@@ -132,24 +119,18 @@ def run_mesh(device, model, sizes):
         row["full"] = row["entries"] > full_refit_fraction(device) * model.face_count  # what the library chooses
         baseline = FaceBvh(*model.mesh_at(finest - step)[:2], device)
         # Not in turn with the others, whose tree it would drive out of the caches.
-        row |= summarise(time_in_turn({"bvh_build": baseline.rebuild}, device, repeats)) | memory
-        rows.append(row)
-        yield row
-    row = {"device": device.name, "case": "crossover", "faces": model.face_count}
-    row |= {f"crossover_{name}": find_crossover(rows, name) for name in ("k", "entries")}
-    yield row | {"slope": fit_slope([row["k"] for row in rows], [row["update_ms"] for row in rows])}
+        yield row | summarise(time_in_turn({"bvh_build": baseline.rebuild}, device, repeats)) | memory
 
 
 def run_states(device, model, count, repeats):
     """Return the row of many states of a model, each at a LOD of its own, moved by a few splits in one call."""
     step = model.lod_max // STATES_PER_MODEL
+    back = [model.lod_max - step * (i % STATES_PER_MODEL) for i in range(count)]
+    # Other models to the scene, so that no state is shared.
+    clones = [copy.copy(model) for _ in range(0, count, STATES_PER_MODEL)]
     scene = ab.Scene(device=device)
-    back = []
-    for i in range(count):
-        if i % STATES_PER_MODEL == 0:
-            clone = copy.copy(model)  # another model to the scene: no state is shared
-        back.append(model.lod_max - step * (i % STATES_PER_MODEL))
-        scene.add(clone, lod=back[-1])
+    for i, lod in enumerate(back):
+        scene.add(clones[i // STATES_PER_MODEL], lod=lod)
     there = [lod - max(1, step // 4) for lod in back]
     row = {"case": "many states"} | measure_update(scene, there, back, model.face_count, repeats)
     if row["states"] != count:

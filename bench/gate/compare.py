@@ -38,11 +38,7 @@ class Tree:
         )
 
     def ask(self, do, **command):
-        """Return the answer to a command.
-
-        Raises:
-            RuntimeError: The worker failed.
-        """
+        """Return the answer to a command; raise a RuntimeError with what the worker says where it failed."""
         print(json.dumps({"do": do, **command}), file=self.process.stdin, flush=True)
         line = self.process.stdout.readline()
         found = json.loads(line) if line else {"error": f"the worker ended with {self.process.wait()}"}
@@ -56,14 +52,8 @@ class Tree:
 
 
 def run(device, before=None, quick=False):
-    """Yield a row a difference of bytes or kernels, a row a launch, and a summary.
-
-    Args:
-        before: The other checkout; None keeps digests, times and kernels of this one.
-
-    Raises:
-        RuntimeError: No such checkout, or a worker failed.
-    """
+    """Yield a row a difference of bytes or kernels from another checkout, a row a launch, and a summary; without one
+    the digests, times and kernels of this one. Raise a RuntimeError where it is no checkout, or a worker failed."""
     device = wp.get_device(device)
     roots = {"now": ROOT} if before is None else {"before": Path(before).resolve(), "now": ROOT}
     for root in roots.values():

@@ -10,6 +10,7 @@ import json
 import sys
 import time
 import traceback
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -20,7 +21,6 @@ from bench.shapes import knot, pair_poses, pose_matrices, random_poses, scene_of
 from bench.timing import make_runs, time_call
 from warp_abtree import testing
 
-IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 FACES = {False: 5000, True: 300}  # of a knot; quick
 FIELDS = ("pairs", "any", "apart", "count", "faces", "contacts", "pair_contacts", "points", "distance", "bracket")
 FIELDS += ("point_faces", "time", "clear", "undecided")
@@ -47,21 +47,11 @@ class Questions:
 
     def apart(self, count):
         """Return a scene of a knot and so many others at random poses about it, and its pairs."""
-        poses = random_poses(2.0, count)
-        scene, pairs = scene_of_poses(self.device, self.model, self.model, [IDENTITY] * count)
-        scene.set_poses(np.concatenate([np.eye(4)[None], pose_matrices(poses)]))
-        return scene, pairs
+        return scene_of_poses(self.device, self.model, self.model, pose_matrices(random_poses(2.0, count)))
 
     def nut(self):
         """Return a scene of a nut on its bolt, and the pair."""
-        scene = ab.Scene(self.device)
-        for model, pose in zip(map(ModelFolder(None).load, ([NUT[0]], [NUT[1]])), (IDENTITY, NUT_POSE)):
-            scene.add(model, pose)
-        return scene, np.array([[0, 1]])
-
-    def ends(self, scene):
-        """Return end poses that bring the objects of a scene of pairs a size further."""
-        return random_poses(2.0, scene.object_count, seed=7)
+        return scene_of_poses(self.device, *(ModelFolder(None).load([name]) for name in NUT), [NUT_POSE])
 
 
 def fields_of(result):
@@ -93,7 +83,7 @@ def ask_distances(ask):
 
 def ask_motions(ask):
     scene, pairs = ask.pairs(ask.few, 3.0)
-    ends = ask.ends(scene)
+    ends = random_poses(2.0, scene.object_count, seed=7)
     for options in ({}, {"screw": True}, {"linear": True}, {"tolerance": 1e-3}):
         yield str(options), fields_of(scene.first_contact(pairs, ends, **options))
 
@@ -138,9 +128,8 @@ def ask_frames(ask):
 ASKED = (ask_outputs, ask_distances, ask_motions, ask_manifolds, ask_trees, ask_sweeps, ask_frames)
 
 
-def launch_query(ask, count, distance, fraction=1.0, output="faces"):
+def launch_query(scene, pairs, output):
     """Return the launch of a query with room for its hits."""
-    scene, pairs = ask.pairs(count, distance, fraction)
     query = ab.ContactQuery(scene, pairs) if output == "contacts" else ab.Query(scene, output, pairs=pairs)
     query.run()
     return query.launch
@@ -150,35 +139,23 @@ def launch_distance(ask, fresh):
     query = ab.DistanceQuery(*ask.apart(ask.many))
     for _ in range(LAUNCHES_BEFORE):
         query.launch()
-
-    def launch_fresh():
-        query.forget()
-        query.launch()
-
-    return launch_fresh if fresh else query.launch
+    return (lambda: (query.forget(), query.launch())) if fresh else query.launch
 
 
 def launch_motion(ask):
     scene, pairs = ask.pairs(ask.many, 3.0)
-    query = ab.FirstContactQuery(scene, ask.ends(scene), pairs)
+    query = ab.FirstContactQuery(scene, random_poses(2.0, scene.object_count, seed=7), pairs)
     query.run()
     return query.launch
 
 
-def launch_nut(ask, output):
-    scene, pairs = ask.nut()
-    query = ab.Query(scene, output, pairs=pairs)
-    query.run()
-    return query.launch
-
-
-def launch_update(ask, fraction, full):
+def launch_update(ask, fraction):
     """Return the launch of an update of four states there and back."""
     scene, models = ab.Scene(ask.device), [ab.Model.from_arrays(*knot(FACES[ask.quick] + 40 * k)) for k in range(4)]
     for model in models:
         scene.add(model)
     there = [round(model.lod_max * (1 - fraction)) for model in models]
-    with testing.force_refits(full):
+    with testing.force_refits(None):
         forth = testing.repeat_update(scene.set_lods(there))
         back = testing.repeat_update(scene.set_lods([model.lod_max for model in models]))
     return lambda: (forth(), back())
@@ -199,37 +176,25 @@ def call_scene(ask, count, output):
 
 def launches(ask):
     """Return makers of launches by name, and those of calls that wait for the device."""
-    made = {"query, 1 pair": lambda: launch_query(ask, 1, 0.9)}
-    made |= {
-        f"query, {n} pairs at {d}": lambda n=n, d=d: launch_query(ask, n, d)
-        for n, d in ((ask.few, 0.9), (ask.many, 0.2))
-    }
+    many = ask.many
+    knots = {"query, 1 pair": (1, 0.9, 1.0, "faces")}
+    knots |= {f"query, {n} pairs at {d}": (n, d, 1.0, "faces") for n, d in ((ask.few, 0.9), (many, 0.2))}
     if ask.device.is_cuda and not ask.quick:
-        made |= {"query, 8192 pairs at 0.9": lambda: launch_query(ask, 8192, 0.9)}
-    made |= {
-        f"query {ask.many}, {output}": lambda output=output: launch_query(ask, ask.many, 0.9, 1.0, output)
-        for output in ("any", "contacts")
-    }
-    made |= {
-        f"coarse {f}, {output}": lambda f=f, output=output: launch_query(ask, ask.many, 0.9, f, output)
-        for f in (0.1, 0.01)
-        for output in ("faces", "any", "contacts")
-    }
-    made |= {
-        f"distance {ask.many}, {kind}": lambda kind=kind: launch_distance(ask, kind == "fresh")
-        for kind in ("fresh", "again")
-    }
-    made |= {f"motion, {ask.many}": lambda: launch_motion(ask)}
-    made |= {f"update, {f}": lambda f=f: launch_update(ask, f, None) for f in (0.003, 0.1, 0.9)}
-    made |= {"frame, 16 objects": lambda: launch_frame(ask)}
+        knots["query, 8192 pairs at 0.9"] = 8192, 0.9, 1.0, "faces"
+    knots |= {f"query {many}, {output}": (many, 0.9, 1.0, output) for output in ("any", "contacts")}
+    for fraction in (0.1, 0.01):
+        knots |= {
+            f"coarse {fraction}, {output}": (many, 0.9, fraction, output) for output in ("faces", "any", "contacts")
+        }
+    made = {name: lambda at=at: launch_query(*ask.pairs(*at[:3]), at[3]) for name, at in knots.items()}
+    made |= {f"distance {many}, {kind}": partial(launch_distance, ask, kind == "fresh") for kind in ("fresh", "again")}
+    made[f"motion, {many}"] = partial(launch_motion, ask)
+    made |= {f"update, {fraction}": partial(launch_update, ask, fraction) for fraction in (0.003, 0.1, 0.9)}
+    made["frame, 16 objects"] = partial(launch_frame, ask)
     if all(map(mesh_file, NUT)):
-        made |= {f"assembly, {output}": lambda output=output: launch_nut(ask, output) for output in ("any", "faces")}
-    calls = {
-        f"host {n}, {output}": lambda n=n, output=output: call_scene(ask, n, output)
-        for n in (1, ask.few)
-        for output in ("any", "faces")
-    }
-    return made, calls
+        made |= {f"assembly, {output}": lambda o=output: launch_query(*ask.nut(), o) for output in ("any", "faces")}
+    asked = [(count, output) for count in (1, ask.few) for output in ("any", "faces")]
+    return made, {f"host {count}, {output}": partial(call_scene, ask, count, output) for count, output in asked}
 
 
 def kernels_of(device):

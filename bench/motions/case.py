@@ -3,11 +3,12 @@
 * queries: contacts missed and reported beyond the truth of `ccd_queries`, where its files are at hand; beside
   Tight-Inclusion's, where ipctk is installed.
 * checked: random motions of two meshes; late and missed by exact tests at many times, early by one after the tolerance.
-* times [ms] of a motion, by tolerance and LOD: meshes that pass each other (across), from far away, in a planner's
-  short steps; and a nut that turns on its bolt, which moves on a screw. On the CPU all on one core.
+* times [ms] of a motion: meshes that pass each other (across), from far away, in a planner's short steps; and a nut
+  that turns on its bolt, which moves on a screw. On the CPU all on one core.
 """
 
 import time
+from collections import Counter
 
 import numpy as np
 import warp as wp
@@ -27,8 +28,7 @@ FULL = {"count": 65536, "checked": 1_000_000, "samples": 32, "repeats": 5, "turn
 CPU = FULL | {"count": 256, "checked": 20_000, "fcl": 8}
 HALF_REVOLUTION = 2.0**-16  # real part of a turn, under which there is none
 QUICK = {"count": 3, "checked": 20, "samples": 4, "repeats": 1, "turn": 0.01, "fcl": 1}
-TOLERANCES, FRACTIONS = (1e-6, 1e-4, 1e-2), (1.0, 0.1, 0.01)
-IDENTITY = (0, 0, 0, 0, 0, 0, 1)
+TOLERANCE = 1e-6
 NUT = ("factory-bolt-m20", "factory-nut-m20")
 
 
@@ -45,15 +45,13 @@ def run(device, count=None, quick=False):
     ways = {"across": (1.2, 1.2), "from far": (4.0, 4.0), "steps": (1.2, None)}
     for way, (first, last) in ways.items():
         poses = random_motions(model, sizes["count"], first, last)
-        for fraction, tolerance in [(1.0, t) for t in TOLERANCES] + [(f, TOLERANCES[0]) for f in FRACTIONS[1:]]:
-            whole = fraction == 1.0 and tolerance == TOLERANCES[0]
-            yield measure(f"{name}, {way}", [model, model], poses, fraction, tolerance, device, sizes, whole)
+        yield measure(f"{name}, {way}", [model, model], poses, device, sizes)
     if all(map(mesh_file, NUT)) and not quick and device.is_cpu:  # one motion keeps one warp of a GPU busy for long
         models = [folder.load([part]) for part in NUT]
         first = place_nut(models, 1)["free"]
         angle = np.deg2rad(sizes["turn"])
         last = turned(angle, z=first[0, 2, 3] + PITCH * angle / (2 * np.pi))[None]
-        yield measure(f"nut, {sizes['turn']:g} degrees", models, (first, last), 1.0, TOLERANCES[0], device, sizes, True)
+        yield measure(f"nut, {sizes['turn']:g} degrees", models, (first, last), device, sizes)
 
 
 def random_motions(model, count, first, last, seed=0):
@@ -73,36 +71,27 @@ def random_motions(model, count, first, last, seed=0):
 
 def check_queries(device, baseline):
     """Return how public queries are answered, and by the baseline if asked, each in so many us a query."""
-    counts = dict.fromkeys(("asked", "contacts", "missed", "beyond", "undecided"), 0)
-    theirs, seconds = dict.fromkeys(("missed", "beyond"), 0), [0.0, 0.0]
+    counts, seconds = Counter(), Counter()
     for number, path in enumerate(sorted(FOLDER.glob("*.csv.gz"))):
         starts, ends, truth = read_queries(path)
         if number == 0:
-            testing.advance_corners(starts, ends, TOLERANCES[0], device)  # compiles
+            testing.advance_corners(starts, ends, TOLERANCE, device)  # compiles
         began = time.perf_counter()
-        _, clear, undecided = testing.advance_corners(starts, ends, TOLERANCES[0], device)
-        seconds[0] += time.perf_counter() - began
-        counts["asked"] += len(truth)
-        counts["contacts"] += int(truth.sum())
-        counts["missed"] += int((truth & clear).sum())
-        counts["beyond"] += int((~truth & ~clear).sum())
-        counts["undecided"] += int(undecided.sum())
+        _, clear, undecided = testing.advance_corners(starts, ends, TOLERANCE, device)
+        seconds["us"] += time.perf_counter() - began
+        counts.update(asked=len(truth), contacts=truth.sum(), undecided=undecided.sum())
+        counts.update(missed=(truth & clear).sum(), beyond=(~truth & ~clear).sum())
         if baseline:
             kind = path.name.split(".")[1]
             points = list(POINTS[kind])
             began = time.perf_counter()
-            collide = np.array(tight_inclusion.find_collisions(kind, starts[:, points], ends[:, points]))
-            seconds[1] += time.perf_counter() - began
-            theirs["missed"] += int((truth & ~collide).sum())
-            theirs["beyond"] += int((~truth & collide).sum())
-    row = {"device": device.name, "case": "queries", **counts}
-    if not row["asked"]:
+            hit = np.array(tight_inclusion.find_collisions(kind, starts[:, points], ends[:, points]))
+            seconds["tight_inclusion_us"] += time.perf_counter() - began
+            counts.update(tight_inclusion_missed=(truth & ~hit).sum(), tight_inclusion_beyond=(~truth & hit).sum())
+    if not counts["asked"]:
         return {"case": "queries", "skipped": "no files: set ABTREE_CCD to their folder"}
-    row["us"] = 1e6 * seconds[0] / row["asked"]
-    if baseline:
-        row |= {f"tight_inclusion_{name}": count for name, count in theirs.items()}
-        row["tight_inclusion_us"] = 1e6 * seconds[1] / row["asked"]
-    return row
+    taken = {name: 1e6 * value / counts["asked"] for name, value in seconds.items()}
+    return {"device": device.name, "case": "queries"} | counts | taken
 
 
 def between(first, last, times):
@@ -124,40 +113,37 @@ def check_motions(name, model, device, sizes):
     late = missed = 0
     for part in np.linspace(0, 1, sizes["samples"]):
         hit = ab.sweep(model, model, between(first, last, part * rows["time"]), device=device)
-        late += int((hit & ~rows["clear"] & (rows["time"] > 0)).sum())
-        missed += int((hit & rows["clear"]).sum())
+        late += (hit & ~rows["clear"] & (rows["time"] > 0)).sum()
+        missed += (hit & rows["clear"]).sum()
     touching = ~rows["clear"] & ~rows["undecided"] & (rows["time"] > 0)
-    later = np.minimum(rows["time"] + TOLERANCES[0], 1)
+    later = np.minimum(rows["time"] + TOLERANCE, 1)
     meets = ab.sweep(model, model, between(first, last, later), device=device)
-    row = {"device": device.name, "case": f"checked, {name}", "asked": len(rows), "clear": int(rows["clear"].sum())}
-    row |= {"at_start": int((rows["time"] == 0).sum()), "undecided": int(rows["undecided"].sum())}
-    return row | {"late": late, "missed": missed, "early": int((touching & ~meets).sum())}
+    row = {"device": device.name, "case": f"checked, {name}", "asked": len(rows), "clear": rows["clear"].sum()}
+    row |= {"at_start": (rows["time"] == 0).sum(), "undecided": rows["undecided"].sum()}
+    return row | {"late": late, "missed": missed, "early": (touching & ~meets).sum()}
 
 
-def measure(name, models, poses, fraction, tolerance, device, sizes, with_fcl):
+def measure(name, models, poses, device, sizes):
     """Return times of a motion [ms], of all at once."""
     first, last = (rows if rows.ndim == 3 else pose_matrices(rows) for rows in poses)
-    scene, pairs = scene_of_poses(device, *models, [IDENTITY] * len(first))
-    scene.set_poses(np.concatenate([np.eye(4)[None], first]))
-    scene.set_lods([models[0].lod_for(fraction=fraction)] + [models[1].lod_for(fraction=fraction)] * len(first))
-    query = ab.FirstContactQuery(scene, np.concatenate([np.eye(4)[None], last]), pairs, tolerance=tolerance)
+    scene, pairs = scene_of_poses(device, *models, first)
+    query = ab.FirstContactQuery(scene, np.concatenate([np.eye(4)[None], last]), pairs, tolerance=TOLERANCE)
     found = query.run()
-    row = {"device": device.name, "case": name, "motions": len(pairs), "fraction": fraction, "tolerance": tolerance}
-    row |= {"clear": int(found.clear.sum()), "at_start": int((found.time == 0).sum())}
-    row |= {"undecided": int(found.undecided.sum()), "node_tests": round(float(found.node_tests.mean()), 1)}
-    row |= {"face_tests": round(float(found.triangle_tests.mean()), 1)}
+    row = {"device": device.name, "case": name, "motions": len(pairs)}
+    row |= {"clear": found.clear.sum(), "at_start": (found.time == 0).sum(), "undecided": found.undecided.sum()}
+    row |= {"node_tests": found.node_tests.mean(), "face_tests": found.triangle_tests.mean()}
     with one_core(), no_garbage_collection():
         times = medians(time_in_turn({"ours": query.launch}, device, sizes["repeats"], time.thread_time))
-        row["ms"] = float(f"{times['ours'] / len(pairs):.4g}")
-        if with_fcl and device.is_cpu:
+        row["ms"] = times["ours"] / len(pairs)
+        if device.is_cpu:
             try:
                 some = slice(0, sizes["fcl"])
                 fcl = Fcl(*[model.mesh_at(model.lod_max)[:2] for model in models], first[some])
                 start = time.thread_time()
                 answers = fcl.first_contacts(last[some])
-                row["fcl_ms"] = float(f"{1e3 * (time.thread_time() - start) / len(answers):.4g}")
-                row["fcl_late"] = int((answers > found.time[some] + 1e-3).sum())
-                row["fcl_early"] = int((answers < found.time[some] - 1e-3).sum())
+                row["fcl_ms"] = 1e3 * (time.thread_time() - start) / len(answers)
+                row["fcl_late"] = (answers > found.time[some] + 1e-3).sum()
+                row["fcl_early"] = (answers < found.time[some] - 1e-3).sum()
                 row["fcl_ratio"] = round(row["fcl_ms"] / row["ms"], 2)
             except ImportError as error:
                 row["fcl_skipped"] = str(error)

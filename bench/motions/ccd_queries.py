@@ -21,11 +21,7 @@ POINTS = {"vertex-face": (0, 3, 4, 5), "edge-edge": (0, 1, 3, 4)}
 
 
 def read_queries(path: Path):
-    """Return corners at first and at last, float64 (p, 6, 3), and whether they touch, bool (p,).
-
-    Raises:
-        ValueError: A coordinate that float64 does not hold.
-    """
+    """Return corners at first and at last, which float64 must hold, (p, 6, 3), and whether they touch, bool (p,)."""
     with gzip.open(path, "rt") as file:
         rows = [[int(x) for x in row] for row in csv.reader(file)]
     points = []

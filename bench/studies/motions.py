@@ -6,15 +6,13 @@ straight line in a random direction; where it is on its way is the distance of t
 
 import numpy as np
 
-import warp_abtree as ab
 from warp_abtree.checks.quaternions import matrices_of
 
-from ..shapes import centre_and_radius, random_directions, scene_of_poses
+from ..shapes import centre_and_radius, random_directions
 
 SCAN_STEPS = 256
 BISECTIONS = 32
 POSES_AT_A_TIME = 4096
-FAR = 1e3  # radii away: where poses that nobody asked for are put
 
 
 class Motions:
@@ -24,14 +22,12 @@ class Motions:
         away: Directions from A's centre, float64 (m, 3).
         rotations: Of B, unit quaternions (m, 4).
         reach: Distance of the centres at which nothing intersects yet.
-        far: Pose of B out of reach, (7,).
     """
 
     def __init__(self, rng, count, model_a, model_b):
         (self.centre_a, radius_a), (self.centre_b, radius_b) = map(centre_and_radius, (model_a, model_b))
         self.away, self.rotations = random_directions(rng, count, 3), random_directions(rng, count, 4)
         self.reach = 1.05 * (radius_a + radius_b)
-        self.far = np.array([*self.centre_a + FAR * (radius_a + radius_b), 0, 0, 0, 1.0])
 
     def __len__(self):
         return len(self.away)
@@ -79,46 +75,3 @@ def find_first_contact(intersects, motions, steps=SCAN_STEPS, bisections=BISECTI
         hit = intersects(motions.poses(middle, which))
         low[which], high[which] = np.where(hit, middle, low[which]), np.where(hit, high[which], middle)
     return low, high
-
-
-class PoseScene:
-    """A scene of A and a number of Bs, room, all of one LOD: any number of poses, so many at a time.
-
-    Bs that are not asked stand at the pose far; pairs are (0, 1), (0, 2), ...
-    """
-
-    def __init__(self, device, models, lods, far, room):
-        self.scene, self.pairs = scene_of_poses(device, *models, np.tile(far, (room, 1)))
-        self.scene.set_lods([lods[0]] + [lods[1]] * room)
-        self.room, self._far, self._queries = room, far, {}
-
-    def place(self, poses):
-        """Pose the first Bs, and put the others away."""
-        still, rest = [(0, 0, 0, 0, 0, 0, 1)], np.tile(self._far, (self.room - len(poses), 1))
-        self.scene.set_poses(np.concatenate([still, poses, rest]))
-
-    def _ask(self, poses, column, within=None):
-        """Return a column of the results at poses, so many at a time, with distances (n,) or without."""
-        if (within is None) not in self._queries:
-            options = {} if within is None else {"within": 0.0}
-            self._queries[within is None] = ab.Query(self.scene, "any", pairs=self.pairs, **options)
-        query, found = self._queries[within is None], np.zeros(len(poses), bool)
-        for start in range(0, len(poses), self.room):
-            part = slice(start, min(start + self.room, len(poses)))
-            self.place(poses[part])
-            query.set_pairs(self.pairs[: part.stop - start], **({} if within is None else {"within": within[part]}))
-            found[part] = getattr(query.run(), column)
-        return found
-
-    def intersects(self, poses):
-        """Return whether A and B intersect at each pose."""
-        return self._ask(poses, "any")
-
-    def near(self, poses, within):
-        """Return whether A and B are not proved farther apart than a distance, at each pose."""
-        return ~self._ask(poses, "apart", np.broadcast_to(np.asarray(within, float), len(poses)))
-
-    def ask(self, poses, output):
-        """Return the `ab.Result` at poses, no more than there is room for."""
-        self.place(poses)
-        return self.scene.intersect(self.pairs[: len(poses)], output)

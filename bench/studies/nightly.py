@@ -1,24 +1,19 @@
 """`python -m bench nightly --out DIR`: times of the cases day by day, and what became slower than before.
 
 Each case runs a few times. DIR/history.jsonl takes one line a case: device, versions, and for each series (a row's key
-and a column of times) the time of every run. DIR/CASE.svg draws them. A series became slower where its median is above
-those of the lines before by more than its times vary, within a run of this command or from one to the next.
+and a column of times) the time of every run. A series became slower where its median is above those of the lines before
+by more than its times vary, within a run of this command or from one to the next.
 """
 
 import importlib
 import json
-import os
-import sys
-from pathlib import Path
 
 import numpy as np
 import warp as wp
 
-import warp_abtree as ab
-
 from .. import tables
 from ..__main__ import describe_run
-from .study import StudyError, describe_device
+from .study import Context, StudyError, describe_device, open_folder
 
 # What tells the rows of a case apart, whatever is measured.
 KEYS = {
@@ -36,36 +31,20 @@ LEAST = 0.05  # fraction below which no change is named: times of one process di
 
 
 def run(device, out, only=None, quick=False, command=None):
-    """Run the cases, append their lines, draw the history; say what became slower.
-
-    Args:
-        only: Names of cases; None runs all.
-
-    Raises:
-        StudyError: An unknown case or device, or a folder or history that cannot be used.
-    """
-    wp.config.log_level = wp.LOG_WARNING
-    unknown = sorted(set(only or ()) - set(KEYS))
-    if unknown:
-        raise StudyError(f"--only: {unknown[0]} is none of {', '.join(KEYS)}")
-    folder = Path(out)
-    try:
-        ab.Scene(device)
-        folder.mkdir(parents=True, exist_ok=True)
-    except (ValueError, OSError) as error:
-        raise StudyError(str(error)) from error
+    """Run the cases, or those of some names, append their lines; say what became slower."""
+    folder = open_folder(device, out, only, KEYS)
     lines = read_history(folder / "history.jsonl")
     about = describe_run() | {"device": describe_device(wp.get_device(device)), "quick": quick, "command": command}
     for name in only or KEYS:
-        print(f"  {name}", file=sys.stderr, flush=True)
+        Context.progress(name)
         line = {"case": name, **about, "series": measure(name, device, quick)}
         before = same_kind(lines, line)
         lines.append(line)
-        append_line(folder / "history.jsonl", line)
+        with open(folder / "history.jsonl", "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
         for series, was, now, noise in find_slower(before, line["series"]):
             print(f"slower: {name}: {series}: {was:.4g} -> {now:.4g} ms, {now / was:.2f} times; noise {noise:.2f}")
         print(f"{name}: {len(line['series'])} series, {len(before)} lines before", flush=True)
-        print(tables.draw([layout(name)], history_rows([*before, line]), folder), flush=True)
 
 
 def measure(name, device, quick) -> dict:
@@ -83,30 +62,17 @@ def measure(name, device, quick) -> dict:
 
 
 def read_history(path) -> list:
-    """Return the lines of a history, none where there is no file.
-
-    Raises:
-        StudyError: A line is not what this command writes.
-    """
+    """Return the lines of a history, none where there is no file; raise a StudyError at one of another command."""
     if not path.exists():
         return []
-    lines = []
-    for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-        try:
-            line = json.loads(text)
-            line["case"], line["device"], line["quick"], line["series"].items()
-        except (ValueError, KeyError, TypeError, AttributeError):
-            raise StudyError(f"{path}: line {number} is none of this command's; move the file away") from None
-        lines.append(line)
-    return lines
-
-
-def append_line(path, line):
-    """Append a line in one write."""
-    with open(path, "a", encoding="utf-8") as file:
-        file.write(json.dumps(line) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
+    lines = path.read_text(encoding="utf-8").splitlines()
+    try:
+        lines = list(map(json.loads, lines))
+        if all({"case", "device", "quick", "series"} <= set(line) for line in lines):
+            return lines
+    except (ValueError, TypeError):
+        pass
+    raise StudyError(f"{path}: a line is none of this command's; move the file away")
 
 
 def same_kind(lines, line) -> list:
@@ -132,20 +98,3 @@ def find_slower(before, series) -> list:
         if now > was * max(noise, 1 + LEAST):
             found.append((name, was, now, noise))
     return found
-
-
-def history_rows(lines) -> list:
-    """Return a row a line and series: its median over that of the first line that has it."""
-    first, rows = {}, []
-    for number, line in enumerate(lines):
-        for name, times in line["series"].items():
-            median = float(np.median(times))
-            rows.append({"line": number, "series": name, "relative": median / first.setdefault(name, median)})
-    return rows
-
-
-def layout(name) -> dict:
-    """Return the figure of a case, see `tables.draw`."""
-    panel = {"x": "line", "xscale": "linear", "by": "series", "legend": False, "y": {"relative": ""}}
-    panel |= {"xlabel": "run of the command", "ylabel": "time over that of the first run", "title": name}
-    return {"file": f"{name}.svg", "panels": [panel]}

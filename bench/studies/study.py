@@ -58,7 +58,8 @@ class Context:
         if text not in self.notes:
             self.notes.append(text)
 
-    def progress(self, text):
+    @staticmethod
+    def progress(text):
         """Say what is being done."""
         print(f"  {text}", file=sys.stderr, flush=True)
 
@@ -79,14 +80,12 @@ class Context:
         Args:
             on_core: Whether these run on the host whatever the device.
         """
-        on_gpu = self.device.is_cuda and not on_core
-        repeats = repeats or self.size(9 if on_gpu else 7, 3)
-        if on_gpu:
-            return timing.medians(timing.time_in_turn(launches, self.device, repeats))
+        if self.device.is_cuda and not on_core:
+            return timing.medians(timing.time_in_turn(launches, self.device, repeats or self.size(9, 3)))
         clocked = {name: timing.time_call(launch, clock=time.thread_time) for name, launch in launches.items()}
         runs = {name: lambda run=run: (run(), run())[1] for name, run in clocked.items()}
         with timing.one_core(), timing.no_garbage_collection():
-            return timing.medians(timing.time_rounds(runs, repeats))
+            return timing.medians(timing.time_rounds(runs, repeats or self.size(7, 3)))
 
 
 def find_study(name):
@@ -112,23 +111,24 @@ class StudyError(ValueError):
     """What was asked for is not there."""
 
 
-def run(device, name, out, quick=False, models=None, only=None, command=None):
-    """Run the parts of a study, or some of them, and write what they found.
-
-    Raises:
-        StudyError: There is no such part, device or folder.
-    """
+def open_folder(device, out, only, names) -> Path:
+    """Return the folder to write to, which is made; raise a StudyError where there is no such part or device."""
     wp.config.log_level = wp.LOG_WARNING
-    parts = find_study(name).PARTS
-    unknown = set(only or ()) - set(parts)
+    unknown = sorted(set(only or ()) - set(names))
     if unknown:
-        raise StudyError(f"no part {', '.join(sorted(unknown))}; there are {', '.join(parts)}")
+        raise StudyError(f"no part {', '.join(unknown)}; there are {', '.join(names)}")
     try:
         ab.Scene(device)
-        out = Path(out)
-        out.mkdir(parents=True, exist_ok=True)
+        Path(out).mkdir(parents=True, exist_ok=True)
     except (ValueError, OSError) as error:
         raise StudyError(str(error)) from error
+    return Path(out)
+
+
+def run(device, name, out, quick=False, models=None, only=None, command=None):
+    """Run the parts of a study, or some of them, and write what they found."""
+    parts = find_study(name).PARTS
+    out = open_folder(device, out, only, parts)
     folder, file = ModelFolder(models or out / "models"), out / f"{name}.json"
     study = {"study": name, "parts": {}}
     if only and file.is_file():

@@ -6,7 +6,7 @@ import trimesh
 import warp as wp
 
 import warp_abtree as ab
-from bench.baselines import newton, newton_nuts, wp_bvh
+from bench.baselines import newton, wp_bvh
 from bench.shapes import knot, pair_poses, scene_of_pairs
 from bench.verify import count_differences
 
@@ -46,29 +46,3 @@ def test_newton_agrees_on_which_pairs_intersect(device):
         found = other.compare(np.arange(6) < 3)
         assert found["contacts"] > 0 and found["any_missed"] == found["any_invented"] == 0
         assert other.compare(np.arange(6) < 2)["any_invented"] == 1
-
-
-class Launched:
-    """A launch that no graph can be made of, if told so, and how often it ran."""
-
-    def __init__(self, device, capturable):
-        self.values, self.capturable, self.count = wp.zeros(4, device=device), capturable, 0
-
-    def launch(self):
-        if self.values.device.is_capturing and not self.capturable:
-            raise RuntimeError("not in a graph")
-        self.values.zero_()
-        self.count += 1
-
-
-@pytest.mark.parametrize("capturable", [True, False])
-def test_all_nuts_are_timed_in_one_way(device, capturable):
-    """Where no graph can be made of one of them, none is replayed."""
-    device = wp.get_device(device)
-    made = {"ours": Launched(device, True), "theirs": Launched(device, capturable)}
-    runs, graphs = newton_nuts.timed(made, device)
-    before = [one.count for one in made.values()]
-    assert all(run() >= 0 for run in runs.values())
-    replayed = device.is_cuda and capturable
-    assert [one.count for one in made.values()] == [count + (not replayed) for count in before]
-    assert (graphs is True) == replayed and ("theirs" in str(graphs)) == (device.is_cuda and not capturable)

@@ -7,9 +7,8 @@ import pytest
 import warp as wp
 
 from bench import __main__ as main
-from bench import gap_contacts
 from bench.baselines.newton import SDF_RESOLUTION
-from bench.cases import budget, build, host
+from bench.cases import budget, build, distance, host
 from bench.tables import pick
 from warp_abtree import testing
 
@@ -43,7 +42,7 @@ def check_query(rows):
 
 
 def check_update(rows):
-    assert [row["faces"] for row in pick(rows, case="crossover")] == [168, 576]
+    assert {row["faces"] for row in pick(rows, case="one state")} == {168, 576}
     for row in pick(rows, case="one state"):
         assert row["k"] <= row["nodes_refitted"] <= row["bound"] and row["entries"] >= row["k"]
         share = testing.current_regime().full_refit["cpu" if row["device"] == "CPU" else "cuda"]
@@ -56,8 +55,8 @@ def check_update(rows):
 def check_scale(rows):
     pairs, meshes, worlds = (pick(rows, sweep=name) for name in ("pairs", "faces", "worlds"))
     assert [row["pairs"] for row in pairs] == [1, 4, 16]
-    assert [(row["faces"], row["pairs"]) for row in meshes] == [(168, 1), (168, 3), (576, 1), (576, 3)]
-    grown = 2**20 * (meshes[2]["arrays_mib"] - meshes[0]["arrays_mib"]) / (576 - 168)
+    assert [(row["faces"], row["pairs"]) for row in meshes] == [(168, 1), (576, 1), (168, 3), (576, 3)]
+    grown = 2**20 * (meshes[1]["arrays_mib"] - meshes[0]["arrays_mib"]) / (576 - 168)
     assert 180 < grown < 340, "bytes a face, of the model and its state, on a GPU with slabs of nodes"
     assert [(row["worlds"], row["objects"]) for row in worlds] == [(1, 4), (8, 32)]
     assert all(row["pairs"] <= 6 * row["worlds"] for row in worlds) and worlds[1]["hits"] > worlds[0]["hits"]
@@ -101,7 +100,7 @@ def check_baselines(rows):
 def check_distance(rows):
     gaps = [row for row in rows if "gap" in row]
     rows = [row for row in rows if "gap" not in row]
-    assert [row["gap"] for row in gaps] == list(gap_contacts.GAPS)
+    assert [row["gap"] for row in gaps] == list(distance.GAPS)
     assert gaps[0]["more"] == 1 < gaps[-1]["more"] and all(row["ratio"] > 0 for row in gaps)
     assert rows[-1]["workload"] == "knot, 3 poses"
     for row in rows:
@@ -113,13 +112,12 @@ def check_motion(rows):
     queries, checked, *times = rows
     assert "skipped" in queries or queries["missed"] == 0 < queries["contacts"]
     assert checked["late"] == checked["missed"] == checked["early"] == 0 < checked["clear"] < checked["asked"]
-    assert len(times) == 15 and all(row["ms"] > 0 and row["undecided"] == 0 for row in times)
+    assert len(times) == 3 and all(row["ms"] > 0 and row["undecided"] == 0 for row in times)
     assert all(row.get("fcl_late", 0) == 0 for row in times)
 
 
 def check_build(rows):
-    *rows, slopes = rows
-    assert [row["faces"] for row in rows] == [168, 576] and slopes["build_ms_slope"] is not None
+    assert [row["faces"] for row in rows] == [168, 576]
     for row in rows:
         stages = sum(row[f"{name}_ms"] for name in ("collapse", "error", "tree"))
         assert stages == pytest.approx(row["build_ms"], rel=0.5) and row["error_ms"] > 0
@@ -142,7 +140,7 @@ def check_budget(rows):
     assert {row["scene"] for row in controlled} >= {"focus", "rain", "worlds"}
     for row in controlled:
         assert row["ratio"] == pytest.approx(row["total_ms"] / row["finest_ms"], rel=0.01) and row["select_ms"] > 0
-    assert [row["controller"] for row in rows if row not in held + controlled] == ["predictive", "paper", "tolerance"]
+    assert len(rows) == len(held) + len(controlled)
     for row in held:
         assert row["judged"] == 3 and 0 <= row["within"] <= row["within_110_percent"] <= 1 and row["budget_ms"] > 0
         assert (row["error_max"] == 0) == (row["controller"] == "none") and row["cost_ms"] <= row["cost_p95_ms"]
@@ -151,11 +149,8 @@ def check_budget(rows):
 
 
 def check_robot(rows):
-    assert [row["output"] for row in rows] == ["any", "distance", "distance", "edges", "spheres", "spheres"]
+    assert [row["output"] for row in rows] == ["any", "distance", "distance", "edges"]
     assert rows[0]["differ_from_fcl"] == 0 and 0 < rows[0]["meet"] < 1 and rows[3]["clear"] > 0
-    cover, less = rows[4:]
-    assert cover["spheres"] == 30 and cover["world_missed"] == cover["all_missed"] == 0 < cover["all_false"]
-    assert less["all_false"] < cover["all_false"]
 
 
 def check_gate(rows):
@@ -174,7 +169,6 @@ def test_case(name, device, tmp_path, monkeypatch, capsys):
     for library in {"baselines": ["fcl"], "robot": ["fcl", "yourdfpy"]}.get(name, []):
         pytest.importorskip(library)
     file, more = tmp_path / "rows.json", ["--plots", str(tmp_path)] if name in PLOTS else []
-    more += ["--processes", "1"] if name == "exact" else []
     assert main.main([name, "--device", device, "--quick", "--json", str(file), *more]) == 0
     written = json.loads(file.read_text())
     assert written["warp"] == wp.config.version and f"{[*written['rows'][-1]][-1]}=" in capsys.readouterr().out
@@ -191,7 +185,6 @@ def test_case(name, device, tmp_path, monkeypatch, capsys):
         assert all((tmp_path / picture).stat().st_size > 10_000 for picture in PLOTS[name])
 
 
-def test_large_meshes_are_left_out_and_models_kept(device, tmp_path, capsys):
-    words = ["update", "--device", device, "--quick", "--largest", "300", "--models", str(tmp_path)]
-    assert main.main(words) == 0 and "faces=576" not in capsys.readouterr().out
-    assert [path.name for path in tmp_path.iterdir()] == ["knot-200-base10.npz"]
+def test_models_are_kept(device, tmp_path):
+    assert main.main(["update", "--device", device, "--quick", "--models", str(tmp_path)]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"knot-200-base10.npz", "knot-600-base10.npz"}

@@ -76,7 +76,7 @@ def check_buffer_lengths(queries):
             pairs += [means.point, means.normal, means.travel, query.start[1:]]
             hits += [query.faces, *(getattr(contacts, name) for name in (*VECTORS, "coplanar"))]
         assert {len(array) for array in pairs} == {rooms.pairs} and {len(array) for array in hits} == {rooms.hits}
-        for asked in (asked for stage in query.stages for asked in [*stage.arrays(rooms), *stage.state_arrays()]):
+        for asked in (asked for stage in query.stages for asked in stage.arrays(rooms)):
             assert asked.is_in_place(), f"{asked.name}: not {asked.shape}"
 
 

@@ -92,6 +92,11 @@ class Operator(DeviceMemory):
         asked.launched = self.guard.launched
         for stage in stages:
             stage.attach(self)
+        # Of stages that have one, looked up once: a call of the host takes some 40 us.
+        self._searches, self._reports, self.readers, self._fitted = (
+            [getattr(stage, name) for stage in stages if getattr(type(stage), name) is not getattr(Stage, name)]
+            for name in ("search", "report", "read", "fits_states")
+        )
         for distance in self._distances.values():
             if distance.value is not None:
                 distance.value = distance.check(None, count)
@@ -139,7 +144,7 @@ class Operator(DeviceMemory):
         if self.broad_phase is None:
             own.append(Array(self.pair_batch, "pairs", wp.vec2i, rooms.pairs))
         for stage in self.stages:
-            own += [*stage.arrays(rooms), *stage.state_arrays()]
+            own += stage.arrays(rooms)
         return own
 
     def _make(self, rooms: Rooms) -> list:
@@ -274,20 +279,18 @@ class Operator(DeviceMemory):
 
     def search(self):
         """Search the pairs in place. Launches only, after making room for tree states that are new."""
-        if not len(self.pairs):
+        if not self.rooms.pairs:
             return
-        if not self.device.is_capturing and not all(
-            asked.is_in_place() for stage in self.stages for asked in stage.state_arrays()
-        ):
+        if self._fitted and not self.device.is_capturing and not all(fits() for fits in self._fitted):
             self.make_room()
-        for stage in self.stages:
-            stage.search()
+        for search in self._searches:
+            search()
 
     def report(self, count: int | None = None):
         """Compute further outputs of the hits, of which there are so many; None: all that have room. Launches only."""
-        if len(self.pairs):
-            for stage in self.stages:
-                stage.report(count)
+        if self.rooms.pairs:
+            for report in self._reports:
+                report(count)
 
     def check_scene(self):
         """Raise RuntimeError where the scene is no longer that of the operator, or a graph is being captured."""
@@ -368,12 +371,12 @@ class Operator(DeviceMemory):
             if first is None:
                 self.launch_search(between)
             found = read() if first is None else first()
-            if found.totals.pairs > len(self.pairs):
+            if found.totals.pairs > self.rooms.pairs:
                 self.make_room(pairs=self.growth * found.totals.pairs)
                 self.launch_search()
                 found = read()
             found = self._grow_uncertain(read, found)
-            if found.totals.hits > len(self.hits.face):
+            if found.totals.hits > self.rooms.hits:
                 self.resize(self.growth * found.totals.hits)
                 self.search()
                 found = read()
@@ -388,7 +391,7 @@ class Operator(DeviceMemory):
 
     def _grow_uncertain(self, read, found: Found) -> Found:
         # How many wait varies for `any`, where the first hit of a pair ends its traversal.
-        while 0 < len(self.hits.uncertain) < min(LIST_MAX, found.totals.uncertain):
+        while 0 < self.rooms.uncertain < min(LIST_MAX, found.totals.uncertain):
             self.make_room(uncertain=min(2 * found.totals.uncertain, LIST_MAX))
             self.search()
             found = read()

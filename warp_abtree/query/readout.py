@@ -105,12 +105,11 @@ class Readout:
             RuntimeError: As `Operator.result`.
         """
         operator = self.operator
-        if len(operator.pairs):  # without room for pairs there are no launches
+        if operator.rooms.pairs:  # without room for pairs there are no launches
             operator.guard.check(found.totals.launched)
-        for stage in operator.stages:
-            stage.read(found, device, with_rows)
-        rooms = len(operator.pairs), len(operator.hits.face), len(operator.hits.uncertain)
-        return Result(found, rooms, operator.output)
+        for read in operator.readers:
+            read(found, device, with_rows)
+        return Result(found, operator.rooms, operator.output)
 
     def read_totals(self) -> Totals:
         """Read what the last launch needed of each list. Waits for the device."""
@@ -120,7 +119,7 @@ class Readout:
         views, hits, total, uncertain = self.views, operator.hits, 0, 0
         if operator.output == "faces":
             total = int(views.counts[0].sum())
-        if len(hits.uncertain):
+        if operator.rooms.uncertain:
             apart = int(hits.apart_total.numpy().view(np.uint32)[0]) if hits.apart_total is not None else 0
             uncertain = max(apart, int(views.counts[FLOAT64_ROW].sum()))
         return Totals(operator.guard.outcome(), self._pair_count(int(views.pair_count[0])), total, uncertain)
@@ -133,7 +132,7 @@ class Readout:
     def _totals(self, words) -> Totals:
         """Return the demands in a header; those of lists that the operator lacks are 0."""
         launched, found, total, uncertain, apart = words[:HEADER].tolist()
-        listed, waits = self.operator.output == "faces", len(self.operator.hits.uncertain)
+        listed, waits = self.operator.output == "faces", self.operator.rooms.uncertain
         return Totals(launched, self._pair_count(found), total if listed else 0, max(uncertain, apart) if waits else 0)
 
     def read_pairs(self, device: bool) -> Found:
@@ -141,7 +140,7 @@ class Readout:
         if not (self.packs or device):
             return self._copy_pairs()
         operator = self.operator
-        n = len(operator.given) if operator.broad_phase is None else min(self.read_totals().pairs, len(operator.pairs))
+        n = len(operator.given) if operator.broad_phase is None else min(self.read_totals().pairs, operator.rooms.pairs)
         if device:
             return self._keep_pairs(n)
         self._pack_pairs(n)
@@ -174,7 +173,7 @@ class Readout:
         if not self.lists_hits or pairs != n or hits == 0:
             return 0
         # A little more, in steps, so that hits that vary find room and launches stay the same.
-        expected = min(-(-hits * 17 // 16 // ROWS_STEP) * ROWS_STEP, len(self.operator.hits.face))
+        expected = min(-(-hits * 17 // 16 // ROWS_STEP) * ROWS_STEP, self.operator.rooms.hits)
         self._sort_hits(expected)
         return expected
 
@@ -201,7 +200,7 @@ class Readout:
     def _copy_pairs(self) -> Found:
         """Copy from arrays that are the host's memory, which the next launch writes."""
         views, totals, operator = self.views, self.read_totals(), self.operator
-        n = min(totals.pairs, len(operator.pairs))
+        n = min(totals.pairs, operator.rooms.pairs)
         pairs = (operator.given if operator.broad_phase is None else views.pairs[:n]).copy()
         apart = None if views.near_hit is None else views.near_hit[:n] == 0
         count, *tests = views.counts[:, :n].copy()
@@ -236,7 +235,7 @@ class Readout:
             words = self.staging.room("words", self._block_length(n), wp.int64)
         words.zero_()
         near = self.staging.no_flags if operator.near is None else operator.near.any_hit
-        threads = max(1, -(-len(operator.pairs) // kernels.BLOCK_DIM)) * kernels.BLOCK_DIM
+        threads = max(1, -(-operator.rooms.pairs // kernels.BLOCK_DIM)) * kernels.BLOCK_DIM
         inputs = [n, operator.broad_phase is not None, operator.pair_batch, operator.hits, near, words]
         operator.launch_kernel(kernels.pack_pair_kernel, threads, inputs, kernels.BLOCK_DIM, (n, words.ptr))
         return words
@@ -245,7 +244,7 @@ class Readout:
         """Read the hits as rows. Waits for the device, unless they stay there."""
         if found.faces is not None:
             return
-        count = min(found.totals.hits, len(self.operator.hits.face))
+        count = min(found.totals.hits, self.operator.rooms.hits)
         if not (self.packs or device):
             found.faces = sort_rows(self.views.faces[:count])
         elif device:

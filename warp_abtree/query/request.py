@@ -11,11 +11,14 @@ from warp_abtree.kernels.intersect import face_pairs
 OUTPUTS = {"any": face_pairs.OUTPUT_ANY, "count": face_pairs.OUTPUT_COUNT, "faces": face_pairs.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.EXACT, "float32": predicates.FLOAT32}
 
-# Options that each output takes beside precision.
+PRECISION_NAMES = tuple(PRECISIONS)  # found without a hash
+
+# Options that each output takes beside precision, in a scene and in a sweep, and all of each.
 _HITS, _DISTANCE = ("within",), ("tolerance", "relative", "beyond", "signed", "originals")
 SCENE_OPTIONS = {"any": _HITS, "count": _HITS, "faces": _HITS, "contacts": ("within", "gap"), "distance": _DISTANCE}
 SWEEP_OPTIONS = {"any": _HITS, "count": _HITS, "faces": (), "distance": _DISTANCE}
 SWEEP_OPTIONS["first_contact"] = "end_poses", "tolerance", "screw", "linear"
+_KNOWN = {id(taken): frozenset(sum(taken.values(), ())) for taken in (SCENE_OPTIONS, SWEEP_OPTIONS)}
 
 # A launch of 32 threads a pair stays within 2^31.
 PAIRS_MAX = 2**26
@@ -74,7 +77,7 @@ def check_request(output: str, precision: str):
     """
     if output not in (*OUTPUTS, "contacts", "distance"):
         raise ValueError(f"output {output!r} is none of 'any', 'count', 'faces', 'contacts', 'distance'")
-    if precision not in tuple(PRECISIONS):
+    if precision not in PRECISION_NAMES:
         raise ValueError(f"precision {precision!r} is neither 'exact' nor 'float32'")
     others = {"contacts": "ContactQuery", "distance": "DistanceQuery"}
     if output in others:
@@ -85,15 +88,14 @@ def check_options(caller: str, taken: dict, output: str, precision: str, options
     """Return the options of an output that are neither None nor False.
 
     Args:
-        taken: Options of each output that the caller has, such as `SCENE_OPTIONS`.
+        taken: `SCENE_OPTIONS` or `SWEEP_OPTIONS`.
 
     Raises:
         TypeError: An option that none of the outputs has.
         ValueError: An unknown output or precision, or an option that means nothing for this output.
     """
-    unknown = set(options) - {name for names in taken.values() for name in names}
-    if unknown:
-        raise TypeError(f"{caller} has no option {sorted(unknown)[0]!r}")
+    if not _KNOWN[id(taken)].issuperset(options):
+        raise TypeError(f"{caller} has no option {min(set(options) - _KNOWN[id(taken)])!r}")
     given = {name: value for name, value in options.items() if value is not None and value is not False}
     if output not in taken:
         check_request(output, precision)
@@ -102,7 +104,7 @@ def check_options(caller: str, taken: dict, output: str, precision: str, options
     for name in given:
         if name not in taken[output]:
             raise ValueError(f"{name} means nothing for output {output!r}")
-    if precision not in tuple(PRECISIONS):
+    if precision not in PRECISION_NAMES:
         check_request("faces", precision)
     return given
 

@@ -76,9 +76,9 @@ class Stage:
         """Return its arrays where there are so many entries."""
         return []
 
-    def state_arrays(self) -> list[Array]:
-        """Return its arrays that have an entry a node or tree state; a graph goes on with what there was."""
-        return []
+    def fits_states(self) -> bool:
+        """Return whether its arrays have room for the tree states that there are; a graph goes on with what it had."""
+        return True
 
     def prepare(self, rooms: Rooms):
         """Make what does not belong to the operator fit for so many entries; before its arrays are made."""

@@ -64,7 +64,7 @@ class KeptQueries:
     def find(self, pairs, output, precision, contact_dtype, options: dict, device: bool) -> Result:
         """Answer `Scene.intersect`."""
         given = check_options("intersect", SCENE_OPTIONS, output, precision, options)
-        tolerances, signed, of_originals = check_distance_options(given)
+        tolerances, signed, of_originals = check_distance_options(given) if output == "distance" else ({}, False, False)
         distances = {name: to_numpy(given[name], name) for name in ("within", "gap", "beyond") if name in given}
         # One for all pairs widens the boxes of the broad phase.
         ones = [float(check_within(value, name=name)) for name, value in distances.items() if value.ndim == 0]
@@ -85,18 +85,19 @@ class KeptQueries:
                 batch = self._scene.batch()
                 refuse_signed(signed, batch.has_solid(None if pairs is None else found))
                 signed = batch.has_solid(found)  # the broad phase may have found surfaces alone
-            tolerances["signed"] = signed
         return self._ask((*key, signed), asked, found, checked, tolerances, contact_dtype, device)
 
-    def _ask(self, key, asked, pairs, distances, settings, contact_dtype, device) -> Result:
+    def _ask(self, key, asked, pairs, distances, tolerances, contact_dtype, device) -> Result:
         """Ask the operator of a key, or one that is made; all is checked."""
         (output, precision, *_), query = key, self.kept.pop(key, None)
         if query is None:
             kind, told = self._kind_of(output, precision)
-            query = kind(asked, pairs=pairs, **told, **distances, **settings)
+            if output == "distance":
+                told["signed"] = key[-1]
+            query = kind(asked, pairs=pairs, **told, **distances, **tolerances)
         else:
             if isinstance(query, DistanceQuery):
-                query.set_tolerance(**{name: value for name, value in settings.items() if name != "signed"})
+                query.set_tolerance(**tolerances)
             if not query.is_asked(pairs, **distances):
                 query.replace_pairs(pairs, **distances)
         if isinstance(query, ContactQuery):

@@ -12,6 +12,5 @@ PARTS = {
 SUMMARIES = {
     "fit_figure_6": update.fit_figure_6,
     "fitted_moves": update.fitted_moves,
-    "step_sizes": budget.step_sizes,
     "thin": update.thin,
 }

@@ -2,13 +2,14 @@
 
 import copy
 import time
+from functools import partial
 
 import numpy as np
 
 import warp_abtree as ab
 
 from ...shapes import longest_side
-from ..motions import Motions, PoseScene, find_first_contact
+from ..motions import Motions, find_first_contact
 
 # The paper's name, its faces and vertices of M^n and M^0; then ours, the best at hand first, and its base faces. The
 # paper's cow is at hand; its bunny is collapsed from the Stanford bunny; another mesh of as many faces is its bones.
@@ -57,14 +58,12 @@ class PosedPairs:
 
     def __init__(self, model, count, device, first_count=1, share=False, steps=32):
         self.motions = Motions(np.random.default_rng(0), count, model, model)
-        finder = PoseScene(device, (model, model), (model.lod_max,) * 2, self.motions.far, count)
-        _, self._free = find_first_contact(finder.intersects, self.motions, steps, bisections=50)
+        ask = partial(ab.sweep, model, model, device=device)
+        _, self._free = find_first_contact(ask, self.motions, steps, bisections=50)
         self._size, self._first_count = longest_side(model), first_count
         self.scene = ab.Scene(device)
-        for _ in range(first_count):
-            self.scene.add(model if share else copy.copy(model))
-        for _ in range(count):
-            self.scene.add(model)
+        firsts = [model if share else copy.copy(model) for _ in range(first_count)]
+        self.scene.add_many([*firsts, *[model] * count], np.tile([0.0, 0, 0, 0, 0, 0, 1], (first_count + count, 1)))
         self.pairs = np.stack([np.arange(count) % first_count, first_count + np.arange(count)], 1)
 
     def place(self, depth):

@@ -52,8 +52,7 @@ def compare_static(context, model, lod, posed):
     for who, result in found.items():
         row[f"{who}_us"] = 1e3 * times[who] / count
         row[f"any_{who}_us"] = 1e3 * times[f"any_{who}"] / count
-        row[f"{who}_nodes"] = float(result.node_tests.mean())
-        row[f"{who}_triangles"] = float(result.triangle_tests.mean())
+        row |= {f"{who}_nodes": result.node_tests.mean(), f"{who}_triangles": result.triangle_tests.mean()}
     row["ratio"] = row["ours_us"] / row["static_us"]
     row["any_ratio"] = row["any_ours_us"] / row["any_static_us"]
     return row | {"node_ratio": row["ours_nodes"] / row["static_nodes"]}

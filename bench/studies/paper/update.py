@@ -57,10 +57,10 @@ def time_move(context, scene, model, home, there):
     moved = context.time_graphs({"there": forth, "between": between, "back": back, "after": after})
     upload_lods(scene)
     row = {"case": "move", "from_finest": home == model.lod_max, "model": model.name, "faces": model.face_count}
-    row |= {"splits": home - there, "k": int(k[0]), "share": k[0] / model.face_count, "entries": entries}
-    row |= {"nodes": int(nodes[0]), "bound": bound_nodes(int(k[0]), model.face_count)}
-    row |= {"refit_ms": times["refit"], "full_ms": times["full"]}
-    return row | {"update_ms": (moved["there"] + moved["back"]) / 2}
+    row |= {"splits": home - there, "k": k[0], "share": k[0] / model.face_count, "entries": entries}
+    row |= {"nodes": nodes[0], "bound": bound_nodes(int(k[0]), model.face_count)}
+    times = {"refit_ms": times["refit"], "full_ms": times["full"], "update_ms": (moved["there"] + moved["back"]) / 2}
+    return row | times
 
 
 def by_model(rows):
@@ -90,11 +90,10 @@ def fit_figure_6(rows):
     for name, moves in by_model(rows).items():
         near, used = near_moves(moves), [row["nodes"] / row["bound"] for row in moves]
         logs = np.log([row["refit_ms"] / row["full_ms"] for row in moves])
-        row = {"model": name, "faces": moves[0]["faces"], "k_min": moves[0]["k"]}
-        row |= {"correlation": correlate(near, "bound", "refit_ms")}
-        row |= {"correlation_all": correlate(moves, "bound", "refit_ms")}
+        row = {"model": name, "faces": moves[0]["faces"], "k_min": moves[0]["k"], "ns_a_node": 1e6 * fit_scale(moves)}
+        row["correlation"], row["correlation_all"] = (correlate(some, "bound", "refit_ms") for some in (near, moves))
         row |= {"correlation_nodes": correlate(near, "nodes", "refit_ms")}
-        row |= {"correlation_counted": correlate(near, "bound", "nodes"), "ns_a_node": 1e6 * fit_scale(moves)}
+        row |= {"correlation_counted": correlate(near, "bound", "nodes")}
         row |= {"nodes_of_bound_min": min(used), "nodes_of_bound_max": max(used)}
         found.append(row | {"crossover": crossover([row["share"] for row in moves], logs, 0.0)})
     return found

@@ -2,11 +2,10 @@
 
 from functools import partial
 
-from . import competitors, distances, lods, motions, settings, summaries
+from . import competitors, distances, lods, motions, summaries
 
 PARTS = {
     "lods": lods.run,
-    "settings": settings.run,
     "competitors": competitors.run,
     "distances": distances.run,
     "motions": motions.run,
@@ -15,11 +14,7 @@ SUMMARIES = {
     "over_meshes": summaries.over_meshes,
     "choose": summaries.choose,
     "by_offset": summaries.by_offset,
-    "precisions": summaries.precisions,
-    "outputs": partial(summaries.summarise, names=("value", "setting")),
-    "margins": partial(summaries.summarise, names=("value", "factor")),
     "over_workloads": summaries.over_workloads,
     "distances": partial(summaries.summarise, names=("method", "setting", "where")),
     "motions": partial(summaries.summarise, names=("method", "setting")),
-    "refined": partial(summaries.summarise, names=("value", "asked")),
 }

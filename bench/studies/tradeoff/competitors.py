@@ -13,17 +13,16 @@ import numpy as np
 import trimesh
 import warp as wp
 
-import warp_abtree as ab
-
 from ...baselines.fcl import Fcl
 from ...baselines.newton import Newton
 from ...shapes import pose_matrices
-from .workload import find_front, judge_answers, judge_contact, workloads
+from .workload import find_front, judge_answers, judge_contact, time_rows, workloads
 
 FRACTIONS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
 QUICK_FRACTIONS = (0.02, 0.1, 0.5, 1)
 SDF_RESOLUTIONS = (32, 64, 128)
 NEWTON_POSES = 1024  # at a time: its time a pose hardly falls beyond, and a body is to be set up for each
+FAR = 1e3  # sizes away
 OURS, OURS_FCL = "our LODs", "our LODs, python-fcl"
 HULL, NEWTON_SDF = "convex hull, python-fcl", "Newton, SDF"
 
@@ -33,15 +32,15 @@ class NewtonPoses(Newton):
 
     def __init__(self, workload, room, hits, device, sdf):
         vertices, faces, _ = workload.a.mesh_at(workload.a.lod_max)
-        self.scale, self.room, self.far = 1 / workload.size, room, workload.motions.far
+        self.scale, self.room = 1 / workload.size, room
         super().__init__(vertices * self.scale, faces, self.pair_rows([]), hits, device, sdf)
 
     def pair_rows(self, poses):
         """Return the poses of all pairs, float32 (2 room, 7): A at the origin, B at poses, the rest of the Bs away."""
         rows = np.zeros((2 * self.room, 7), np.float32)
-        rows[::2, 6], rows[1::2] = 1, self.far
+        rows[:, 6], rows[1::2, 0] = 1, FAR
         rows[1 : 2 * len(poses) : 2] = np.reshape(poses, (-1, 7))
-        rows[1::2, :3] *= self.scale
+        rows[1 : 2 * len(poses) : 2, :3] *= self.scale
         return rows
 
     def intersects(self, poses):
@@ -64,14 +63,12 @@ def measure(workload, method, setting, intersects, **more):
 
 def our_points(context, workload):
     """Yield the points of our LODs."""
-    poses = workload.timed_poses()
+    poses = workload.repeated()
     for value in context.size(FRACTIONS, QUICK_FRACTIONS):
         lods = workload.lods(fraction=value)
         about = {"share": workload.fraction(lods), "where": "GPU" if context.device.is_cuda else "CPU core"}
-        scene = workload.scene(lods)
-        row = measure(workload, OURS, f"{value:.3g} of the faces", scene.intersects, **about)
-        scene.place(poses)
-        query = ab.Query(scene.scene, "any", pairs=scene.pairs[: len(poses)])
+        row = measure(workload, OURS, f"{value:.3g} of the faces", workload.ask_at(lods), **about)
+        query = workload.query(lods, poses, "any")
         query.run()
         yield row, query.launch
 
@@ -117,8 +114,8 @@ def newton_points(context, workload):
         return
     if context.library("newton") is None:
         return
-    poses = workload.timed_poses(NEWTON_POSES)
-    hits = int(workload.finest.ask(workload.poses, "count").count.sum()) * (len(poses) // len(workload.poses))
+    poses = workload.repeated(least=NEWTON_POSES)
+    hits = workload.query(workload.finest, poses, "count").run().count.sum()
     for sdf in SDF_RESOLUTIONS:
         setting = f"{sdf} voxels"
         try:
@@ -157,9 +154,6 @@ def time_points(context, workload, found):
     rows = [row for row, _ in found]
     for on_gpu in (False, True):
         mine = {k: launch for k, (row, launch) in enumerate(found) if launch and (row["where"] == "GPU") == on_gpu}
-        times = context.time_launches(mine, on_core=not on_gpu) if mine else {}
-        count = len(workload.timed_poses() if on_gpu else workload.poses)
-        for k, milliseconds in times.items():
-            rows[k]["us"] = 1e3 * milliseconds / count
+        time_rows(context, rows, mine, len(workload.repeated() if on_gpu else workload.poses), on_core=not on_gpu)
     fronts = find_front([row["us"] for row in rows], [row["contact_mean"] for row in rows])
     return [row | {"front": front} for row, front in zip(rows, fronts, strict=True)]

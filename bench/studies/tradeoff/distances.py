@@ -3,143 +3,70 @@
 Poses lie along the motions, `GAPS` before the first contact. Each search starts anew. A LOD proves that the originals
 are no nearer than its distance less both certified errors, a tolerance that they are no nearer than its bracket's lower
 end: `proved` is how far below the distance that is, on average.
-
-Refining asks a LOD with half of what is asked, and the finest LODs about the pairs that this leaves undecided. It is
-given the nearest faces of the originals as the upper bound, so that no way to find some can decide more.
 """
 
 import numpy as np
 
-import warp_abtree as ab
-
 from ...baselines.fcl import Fcl
 from ...shapes import pose_matrices
-from ..motions import POSES_AT_A_TIME
-from .workload import workloads
+from .workload import relate, time_rows, workloads
 
 GAPS = (0.3, 0.1, 0.03, 0.01)  # of the size, from the first contact
 FRACTIONS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
 QUICK_FRACTIONS = (0.02, 0.1, 1)
 RELATIVE = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
-REFINED = (0.01, 0.1)  # fractions of the faces
-ASKED = ({"relative": 0.5}, {"relative": 0.2}, {"relative": 0.05}, {"tolerance": 0.1}, {"tolerance": 0.03})
 OURS, OURS_FCL, TOLERANCE = "our LODs", "our LODs, python-fcl", "tolerance at the finest LODs"
 
 
-class Distances:
-    """A workload's poses apart, on CUDA several times over, and queries about them at LODs.
-
-    Attributes:
-        poses, truth: All poses, and their distances at the finest LODs.
-        once: How many of the first are not repeated.
-    """
-
-    def __init__(self, context, workload):
-        self.context, self.workload = context, workload
-        posed = min(context.size(24, 6), len(workload.low))
-        which = np.tile(np.arange(posed), len(GAPS))
-        along = workload.low[which] + np.repeat(GAPS, posed) * workload.size
-        poses, self.once = workload.motions.poses(along, which), len(which)
-        self.poses = np.tile(poses, (-(-POSES_AT_A_TIME // self.once) if context.device.is_cuda else 1, 1))
-        self._scenes = {}
-        self.truth = self.ask((workload.a.lod_max, workload.b.lod_max)).run().distance
-
-    def ask(self, lods, which=slice(None), **options):
-        """Return a query of some poses at LODs."""
-        if lods not in self._scenes:
-            self._scenes[lods] = self.workload.scene(lods, len(self.poses))
-            self._scenes[lods].place(self.poses)
-        scene = self._scenes[lods]
-        return ab.DistanceQuery(scene.scene, scene.pairs[: len(self.poses)][which], **options)
-
-    def lods(self, fraction):
-        """Return LODs of a fraction of the faces, 1 for the finest."""
-        return self.workload.lods(fraction=fraction)
-
-    def time(self, queries: dict) -> dict:
-        """Return the time of a pose [us] of each query, in turn; each search starts anew."""
-        anew = {name: lambda query=query: (query.forget(), query.launch()) for name, query in queries.items()}
-        return {name: 1e3 * time / len(self.poses) for name, time in self.context.time_launches(anew).items()}
-
-    def row(self, method, setting, found, proved, share, on_core):
-        """Return a row of distances, time aside."""
-        error = np.abs(found - self.truth[: len(found)]) / self.workload.size
-        row = {"case": "distance", "workload": self.workload.name, "method": method, "setting": setting}
-        row |= {"where": "CPU core" if on_core else "GPU", "share": share, "proved": float(proved / self.workload.size)}
-        return row | {"distance_mean": float(error.mean()), "distance_max": float(error.max())}
+def find_poses(context, workload):
+    """Return poses apart, on CUDA several times over, and how many of the first are not repeated."""
+    posed = min(context.size(24, 6), len(workload.low))
+    which = np.tile(np.arange(posed), len(GAPS))
+    along = workload.low[which] + np.repeat(GAPS, posed) * workload.size
+    return workload.repeated(workload.motions.poses(along, which)), len(which)
 
 
-def measure_levels(distances):
-    """Return rows of LODs and of tolerances at the finest, with their times."""
-    context, workload = distances.context, distances.workload
-    on_core, rows, queries = context.device.is_cpu, {}, {}
-    for value in context.size(FRACTIONS, QUICK_FRACTIONS):
-        lods, setting = distances.lods(value), f"{value:.3g} of the faces"
-        queries[OURS, setting] = query = distances.ask(lods)
-        shared = workload.bound(lods), workload.fraction(lods)
-        rows[OURS, setting] = distances.row(OURS, setting, query.run().distance, *shared, on_core)
+def describe(workload, method, found, truth, proved, share, where):
+    """Return a row of distances, setting and time aside."""
+    error = np.abs(found - truth[: len(found)]) / workload.size
+    row = {"case": "distance", "workload": workload.name, "method": method, "where": where, "share": share}
+    return row | {"proved": proved / workload.size, "distance_mean": error.mean(), "distance_max": error.max()}
+
+
+def measure(context, workload):
+    """Return rows of LODs and of tolerances at the finest, and of python-fcl on the LODs, with their times."""
+    poses, once = find_poses(context, workload)
+    where = "CPU core" if context.device.is_cpu else "GPU"
+    levels = {value: workload.lods(fraction=value) for value in context.size(FRACTIONS, QUICK_FRACTIONS)}
+    truth = workload.query(levels[1], poses, "distance").run().distance
+    rows, queries = {}, {}
+    for value, lods in levels.items():
+        key = OURS, f"{value:.3g} of the faces"
+        queries[key] = query = workload.query(lods, poses, "distance")
+        shown = workload.bound(lods), workload.fraction(lods), where
+        rows[key] = describe(workload, OURS, query.run().distance, truth, *shown)
     for value in context.size(RELATIVE, RELATIVE[::2]):
-        setting = f"{value:.0%} of the distance"
-        queries[TOLERANCE, setting] = query = distances.ask(distances.lods(1), relative=value)
+        key = TOLERANCE, f"{value:.0%} of the distance"
+        queries[key] = query = workload.query(levels[1], poses, "distance", relative=value)
         found = query.run()
-        proved = (distances.truth - found.bracket[:, 0]).mean()
-        rows[TOLERANCE, setting] = distances.row(TOLERANCE, setting, found.distance, proved, 1.0, on_core)
-    for key, us in distances.time(queries).items():
-        rows[key]["us"] = us
-    rows |= measure_fcl(distances)
-    whole = rows[OURS, "1 of the faces"]["us"]
-    return [row | {"cost": row["us"] / whole} for row in rows.values()]
-
-
-def measure_fcl(distances) -> dict:
-    """Return rows of python-fcl on our LODs, with their times."""
-    context, workload, rows, queries = distances.context, distances.workload, {}, {}
-    if context.library("fcl") is None:
-        return rows
-    matrices = pose_matrices(distances.poses[: distances.once])
-    for value in context.size(FRACTIONS, QUICK_FRACTIONS):
-        lods, setting = distances.lods(value), f"{value:.3g} of the faces"
-        meshes = [model.mesh_at(lod)[:2] for model, lod in zip((workload.a, workload.b), lods, strict=True)]
-        fcl = Fcl(*meshes, matrices)
-        found = np.maximum(fcl.distances(), 0.0)
-        shared = workload.bound(lods), workload.fraction(lods)
-        rows[OURS_FCL, setting] = distances.row(OURS_FCL, setting, found, *shared, True)
-        queries[OURS_FCL, setting] = fcl.distances
-    for key, time in context.time_launches(queries, on_core=True).items():
-        rows[key]["us"] = 1e3 * time / distances.once
-    return rows
-
-
-def measure_refining(distances):
-    """Return rows of refining from a LOD, beside the finest LODs at once, with their times."""
-    workload, rows, queries = distances.workload, [], {}
-    for value in REFINED:
-        lods = distances.lods(value)
-        errors = workload.bound(lods)
-        for options in ASKED:
-            asked = {name: x * (workload.size if name == "tolerance" else 1) for name, x in options.items()}
-            coarse = distances.ask(lods, **{name: x / 2 for name, x in asked.items()})
-            lower = coarse.run().bracket[:, 0] - errors
-            width = np.maximum(asked.get("tolerance", 0.0), asked.get("relative", 0.0) * distances.truth)
-            left = np.flatnonzero((lower <= 0) | (distances.truth - lower > width))
-            number, words = len(rows), " ".join(f"{name} {x}" for name, x in options.items())
-            queries[number, "lods"] = coarse
-            queries[number, "finest"] = distances.ask(distances.lods(1), **asked)
-            if len(left):
-                queries[number, "left"] = distances.ask(distances.lods(1), left, **asked)
-            decided = 1 - len(left) / len(distances.truth)
-            row = {"case": "refine", "workload": workload.name, "value": value, "asked": words, "decided": decided}
-            rows.append(row | {"bound": errors / workload.size, "left_us": 0.0})
-    for query in queries.values():
-        query.run()
-    for (number, name), us in distances.time(queries).items():
-        rows[number][f"{name}_us"] = us
-    return [row | {"refine_cost": (row["lods_us"] + row["left_us"]) / row["finest_us"]} for row in rows]
+        proved = (truth - found.bracket[:, 0]).mean()
+        rows[key] = describe(workload, TOLERANCE, found.distance, truth, proved, 1.0, where)
+    anew = {key: lambda query=query: (query.forget(), query.launch()) for key, query in queries.items()}
+    time_rows(context, rows, anew, len(poses))
+    if context.library("fcl") is not None:
+        theirs = {}
+        for value, lods in levels.items():
+            key = OURS_FCL, f"{value:.3g} of the faces"
+            meshes = [model.mesh_at(lod)[:2] for model, lod in zip((workload.a, workload.b), lods, strict=True)]
+            fcl = Fcl(*meshes, pose_matrices(poses[:once]))
+            shown = workload.bound(lods), workload.fraction(lods), "CPU core"
+            rows[key] = describe(workload, OURS_FCL, np.maximum(fcl.distances(), 0.0), truth, *shown)
+            theirs[key] = fcl.distances
+        time_rows(context, rows, theirs, once, on_core=True)
+    return relate(rows, (OURS, "1 of the faces"))
 
 
 def run(context):
-    """Yield one row a workload, method and setting, and one a workload, LOD and tolerance that is refined from it."""
+    """Yield one row a workload, method and setting."""
     for workload in workloads(context):
-        distances = Distances(context, workload)
-        yield from measure_levels(distances)
-        yield from measure_refining(distances)
+        yield from measure(context, workload)

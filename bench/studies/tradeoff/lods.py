@@ -2,8 +2,6 @@
 
 import numpy as np
 
-import warp_abtree as ab
-
 from .regions import compare_normals, compare_regions, make_regions, resultants
 from .workload import judge_answers, judge_contact, workloads
 
@@ -20,57 +18,50 @@ class LodLevels:
 
     def __init__(self, workload):
         self.workload = workload
-        self.exact = workload.finest.ask(workload.poses, "contacts")
+        self.exact = workload.query(workload.finest, workload.poses, "contacts").run()
         self.exact.check()
         if not np.array_equal(self.exact.any, workload.truth):
             raise RuntimeError("outputs 'any' and 'contacts' differ at the finest LODs")
         self.regions = make_regions(self.exact.contacts, len(workload.poses), workload.size)
         self.clear = resultants(self.exact.contacts, len(workload.poses)) > CLEAR
-        self.rows, self.scenes = [], []
+        self.levels = []
 
     def measure(self, kind, value, lods):
         """Add the row of a level, times aside; yield one row a distance from the first contact."""
         workload, exact = self.workload, self.exact
-        scene = workload.scene(lods)
-        found = scene.ask(workload.poses, "contacts")
-        error = workload.first_contact(scene.intersects)
+        found = workload.query(lods, workload.poses, "contacts").run()
+        error = workload.first_contact(workload.ask_at(lods))
         bound = workload.bound(lods) / workload.size
         row = {"case": "level", "workload": workload.name, "kind": kind, "value": value}
         row |= {"share": workload.fraction(lods), "bound": bound}
         row |= judge_answers(found.any, exact.any) | judge_contact(error)
         if bound:
-            row["contact_over_bound"] = int((np.abs(error) > bound).sum())
+            row["contact_over_bound"] = (np.abs(error) > bound).sum()
         row |= compare_regions(make_regions(found.contacts, len(workload.poses), workload.size), self.regions)
         row |= compare_normals(found.pair_contacts, exact.pair_contacts, self.clear)
-        row |= {"contacts": len(found.contacts), "contacts_node_tests": float(found.node_tests.mean())}
-        row["node_tests"] = float(scene.ask(workload.poses, "any").node_tests.mean())
-        self.rows.append(row)
-        self.scenes.append(scene)
+        row |= {"contacts": len(found.contacts), "contacts_node_tests": found.node_tests.mean()}
+        row["node_tests"] = workload.query(lods, workload.poses, "any").run().node_tests.mean()
+        self.levels.append((row, lods))
         for offset in np.unique(workload.offset) if kind == "fraction" else ():
             at = workload.offset == offset
-            about = {"case": "offset", "workload": workload.name, "value": value, "offset": float(offset)}
+            about = {"case": "offset", "workload": workload.name, "value": value, "offset": offset}
             yield about | judge_answers(found.any[at], exact.any[at])
 
     def time(self, context):
         """Return the rows with their times, taken in turn."""
-        poses, launches = self.workload.timed_poses(), {}
-        for number, (row, scene) in enumerate(zip(self.rows, self.scenes, strict=True)):
-            scene.place(poses)
-            pairs = scene.pairs[: len(poses)]
+        poses, launches, rows = self.workload.repeated(), {}, [row for row, _ in self.levels]
+        for number, (row, lods) in enumerate(self.levels):
             room = max(1024, row["contacts"] * (len(poses) // len(self.workload.poses)))
-            queries = {
-                "any": ab.Query(scene.scene, "any", pairs=pairs),
-                "contacts": ab.ContactQuery(scene.scene, pairs, capacity=room),
-            }
-            for output, query in queries.items():
+            for output, options in {"any": {}, "contacts": {"capacity": room}}.items():
+                query = self.workload.query(lods, poses, output, **options)
                 query.run().check()
                 launches[number, output] = query.launch
         for (number, output), milliseconds in context.time_launches(launches).items():
-            self.rows[number][f"{output}_us"] = 1e3 * milliseconds / len(poses)
-        finest = next(row for row in self.rows if (row["kind"], row["value"]) == ("fraction", 1))
-        for row in self.rows:
+            rows[number][f"{output}_us"] = 1e3 * milliseconds / len(poses)
+        finest = next(row for row in rows if (row["kind"], row["value"]) == ("fraction", 1))
+        for row in rows:
             row |= {f"{output}_cost": row[f"{output}_us"] / finest[f"{output}_us"] for output in ("any", "contacts")}
-        return self.rows
+        return rows
 
 
 def run(context):

@@ -3,10 +3,11 @@
 import numpy as np
 
 from ...tables import pick
+from .workload import rates
 
-SUMMED = ("poses", "meet", "missed", "invented", "undecided", "hits", "faces_missed", "faces_invented")
+SUMMED = ("poses", "meet", "missed", "invented", "undecided")
 LARGEST = ("early_max", "late_max", "contact_max", "region_hausdorff_max", "distance_max")
-RATIOS = ("us", "cost", "build_s", "of_finest", "any_cost", "contacts_cost", "refine_cost")
+RATIOS = ("us", "cost", "build_s", "any_cost", "contacts_cost")
 TESTS = ("node_tests", "contacts_node_tests")
 RATIOS += tuple(f"{name}_cost" for name in TESTS)
 SHOWN_OFFSETS = (0.01, 0.1, 0.5)  # fractions of the faces
@@ -44,9 +45,7 @@ def aggregate(rows) -> dict:
         else:
             row[name] = max(found) if name in LARGEST else float(np.mean(found))
     if "meet" in row:
-        hits = row["meet"] - row["missed"]
-        row["precision"] = hits / (hits + row["invented"]) if hits + row["invented"] else None
-        row["recall"] = hits / row["meet"] if row["meet"] else None
+        row |= rates(row["meet"], row["missed"], row["invented"])
     return row
 
 
@@ -110,12 +109,6 @@ def by_offset(rows):
             row[f"wrong {value}"] = wrong / sum(member["poses"] for member in at) if at else None
         found.append(row)
     return found
-
-
-def precisions(rows):
-    """Return one row a fraction of the faces, kind of poses and precision."""
-    found = summarise(rows, ("value", "poses_kind", "setting"))
-    return sorted(found, key=lambda row: (-row["value"], row["poses_kind"]))
 
 
 def over_workloads(rows):

@@ -2,17 +2,13 @@
 
 import numpy as np
 
-from ...shapes import longest_side
-from ..motions import POSES_AT_A_TIME, SCAN_STEPS, Motions, PoseScene, find_first_contact
+import warp_abtree as ab
 
-REAL = {
-    "cow": ("cow", "cow"),
-    "fandisk": ("fandisk", "fandisk"),
-    "homer": ("homer", "homer"),
-    "rocker-arm": ("rocker-arm", "rocker-arm"),
-    "bunny": ("stanford-bunny", "stanford-bunny"),
-    "env-rob": ("fcl-env", "fcl-rob"),
-}
+from ...shapes import longest_side, scene_of_poses
+from ..motions import POSES_AT_A_TIME, SCAN_STEPS, Motions, find_first_contact
+
+REAL = {name: (name, name) for name in ("cow", "fandisk", "homer", "rocker-arm")}
+REAL |= {"bunny": ("stanford-bunny",) * 2, "env-rob": ("fcl-env", "fcl-rob")}
 WITHOUT_REAL = {"warp bear": ("warp:bear",) * 2, "warp bunny": ("warp:bunny",) * 2, "warp rocks": ("warp:rocks",) * 2}
 KNOT = {"knot": ("knot:5000",) * 2}
 QUICK = ("cow", "env-rob", "warp bear")
@@ -44,7 +40,7 @@ class Workload:
         low: Where each motion is first in contact.
         poses, offset: Poses (n, 7) of the first motions, from apart through touching to deep, and where they are from
             the first contact, in sizes; at 0 both sides of it.
-        finest, truth: A scene of both at their finest LODs, and its answer at each pose.
+        finest, truth: Both finest LODs, and their answer at each pose.
     """
 
     def __init__(self, context, name, model_a, model_b):
@@ -53,8 +49,8 @@ class Workload:
         count, posed = context.size((64, 24), (12, 6))
         self.motions = Motions(np.random.default_rng(7), 2 * count, model_a, model_b)
         self.steps = context.size(SCAN_STEPS, 64)
-        self.finest = self.scene((model_a.lod_max, model_b.lod_max), min(POSES_AT_A_TIME, 16 * count))
-        low, high = find_first_contact(self.finest.intersects, self.motions, self.steps)
+        self.finest = model_a.lod_max, model_b.lod_max
+        low, high = find_first_contact(self.ask_at(self.finest), self.motions, self.steps)
         chosen = np.flatnonzero(~np.isnan(low))[:count]
         self.motions.away, self.motions.rotations = self.motions.away[chosen], self.motions.rotations[chosen]
         self.low = low[chosen]
@@ -65,16 +61,27 @@ class Workload:
         kept = along >= 0
         self.offset = offset[kept]
         self.poses = self.motions.poses(along[kept], which[kept])
-        self.truth = self.finest.intersects(self.poses)
+        self.truth = self.ask_at(self.finest)(self.poses)
 
-    def scene(self, lods, room=None):
-        """Return a scene at LODs of A and B, with room for the poses to time."""
-        room = room or max(len(self.timed_poses()), self.finest.room)
-        return PoseScene(self.device, (self.a, self.b), lods, self.motions.far, room)
+    def ask_at(self, lods):
+        """Return a function of poses: whether A and B intersect at LODs."""
+        return lambda poses: ab.sweep(self.a, self.b, poses, *lods, device=self.device)
+
+    def place(self, lods, poses):
+        """Return a scene of A and a B at each pose, at LODs, and its pairs."""
+        scene, pairs = scene_of_poses(self.device, self.a, self.b, poses)
+        scene.set_lods([lods[0]] + [lods[1]] * len(poses))
+        return scene, pairs
+
+    def query(self, lods, poses, output, **options):
+        """Return a query of poses at LODs, whose first run makes room for what it finds."""
+        make = {"contacts": ab.ContactQuery, "distance": ab.DistanceQuery}.get(output)
+        asked = {} if make else {"output": output}
+        scene, pairs = self.place(lods, poses)
+        return (make or ab.Query)(scene, pairs=pairs, **asked, **options)
 
     def lods(self, fraction=None, tolerance=None):
-        """Return LODs of A and B: of a fraction of the faces (0 is the base), or whose errors sum to a tolerance
-        [sizes]."""
+        """Return LODs of A and B: of a fraction of the faces (0 is the base), or of errors that sum to a tolerance."""
         if fraction == 0:
             return 0, 0
         if fraction is not None:
@@ -91,40 +98,52 @@ class Workload:
         return sum(counts) / (self.a.face_count + self.b.face_count)
 
     def first_contact(self, intersects):
-        """Return the error of the first contact along each motion [sizes]: above 0 too early, below 0 too late.
-
-        NaN where there is none.
-        """
+        """Return errors of the first contacts of the motions [sizes]: above 0 early, below 0 late, NaN without one."""
         low, _ = find_first_contact(intersects, self.motions, self.steps)
         return (low - self.low) / self.size
 
-    def timed_poses(self, least=POSES_AT_A_TIME):
-        """Return poses to time: all of them, on CUDA several times over, at least so many: work for the device."""
-        times = -(-least // len(self.poses)) if self.device.is_cuda else 1
-        return np.tile(self.poses, (times, 1))
+    def repeated(self, poses=None, least=POSES_AT_A_TIME):
+        """Return poses, by default all, on CUDA several times over, at least so many: work for the device."""
+        poses = self.poses if poses is None else poses
+        return np.tile(poses, (-(-least // len(poses)) if self.device.is_cuda else 1, 1))
+
+
+def time_rows(context, rows, launches, count, on_core=False):
+    """Add the time of one of so many poses [us] to rows by setting, whose launches are taken in turn."""
+    for key, milliseconds in context.time_launches(launches, on_core=on_core).items():
+        rows[key] |= {"us": 1e3 * milliseconds / count}
+
+
+def relate(rows, whole) -> list:
+    """Return rows by (method, setting) with both, and their costs relative to one of them."""
+    return [
+        row | {"method": method, "setting": setting, "cost": row["us"] / rows[whole]["us"]}
+        for (method, setting), row in rows.items()
+    ]
 
 
 def judge_answers(found, truth):
     """Return columns of yes-or-no answers beside the truth: counts, precision and recall (None of nothing)."""
-    hits, invented, missed = (int(x.sum()) for x in (found & truth, found & ~truth, ~found & truth))
-    row = {"poses": len(truth), "meet": int(truth.sum()), "missed": missed, "invented": invented}
-    row["precision"] = hits / (hits + invented) if hits + invented else None
-    return row | {"recall": hits / (hits + missed) if hits + missed else None}
+    row = {"poses": len(truth), "meet": truth.sum(), "missed": (~found & truth).sum()}
+    row["invented"] = (found & ~truth).sum()
+    return row | rates(row["meet"], row["missed"], row["invented"])
+
+
+def rates(meet, missed, invented):
+    """Return precision and recall, None of nothing."""
+    hits = meet - missed
+    return {"precision": hits / (hits + invented) if hits + invented else None, "recall": hits / meet if meet else None}
 
 
 def judge_contact(error):
     """Return columns of errors of the first contact [sizes]: mean and largest size, and the largest of either sign."""
     known = error[~np.isnan(error)]
-    columns = {
-        "contact_mean": lambda: np.abs(known).mean(),
-        "contact_max": lambda: np.abs(known).max(),
-        "early_max": lambda: max(0.0, known.max()),
-        "late_max": lambda: max(0.0, -known.min()),
-        "early": lambda: (known > 0).mean(),
-        "late": lambda: (known < 0).mean(),
-    }
-    row = {name: float(column()) if len(known) else None for name, column in columns.items()}
-    return {"never": int(np.isnan(error).sum())} | row
+    row = {"never": len(error) - len(known)}
+    if not len(known):
+        return row | dict.fromkeys(("contact_mean", "contact_max", "early_max", "late_max", "early", "late"))
+    row |= {"contact_mean": np.abs(known).mean(), "contact_max": np.abs(known).max()}
+    row |= {"early_max": max(0.0, known.max()), "late_max": max(0.0, -known.min())}
+    return row | {"early": (known > 0).mean(), "late": (known < 0).mean()}
 
 
 def find_front(costs, errors):

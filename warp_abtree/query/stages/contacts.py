@@ -187,7 +187,7 @@ class ContactStage(Stage):
             self._listed_totals.zero_()
         if not self.sort.launch(count, self.order, self.key, self.faces, ends=ends):
             inputs = [self.start, self._sums.span]
-            operator.launch_kernel(chunks.locate_chunk_kernel, self._chunk_count(count, len(operator.pairs)), inputs)
+            operator.launch_kernel(chunks.locate_chunk_kernel, self._chunk_count(count, operator.rooms.pairs), inputs)
 
     def _find(self, count: int):
         operator, launch, contacts = self.operator, self.operator.launch_kernel, self.contacts
@@ -199,7 +199,7 @@ class ContactStage(Stage):
         if warps:
             launch(contact.find_contact_kernel, count, inputs, WARP_SIZE)
         else:
-            launch(simd.find_pair_contacts_kernel, len(operator.pairs), inputs)
+            launch(simd.find_pair_contacts_kernel, operator.rooms.pairs, inputs)
         processors = operator.device.sm_count * WARP_SIZE if operator.device.is_cuda else 0
         if self._with_gap:
             if warps:
@@ -212,7 +212,7 @@ class ContactStage(Stage):
         launch(contact.find_deferred_kernel, step, [step, *posed, self.faces, self.deferred, contacts], WARP_SIZE)
 
     def _reduce(self, count: int):
-        operator, room, means = self.operator, len(self.operator.pairs), self.pair_contacts
+        operator, room, means = self.operator, self.operator.rooms.pairs, self.pair_contacts
         count, sums = self._chunk_count(count, room), self._sums
         given = [operator.batch.trees, operator.pair_batch, self.start, self.faces, self.contacts]
         if not operator.uses_warps():

@@ -147,7 +147,7 @@ class DistanceStage(Stage):
         return [*[(kernel, WARP_SIZE) for kernel in kernels], *making]
 
     def arrays(self, rooms: Rooms) -> list[Array]:
-        """Return what has an entry a pair or a thread."""
+        """Return what has an entry a pair, a thread, or a node of the tree states that there are now."""
         pairs, operator, found = rooms.pairs, self.operator, self.found
         warps = operator.uses_warps()
         threads = 0 if warps else min(pairs, operator.regime.cpu_threads or core_count())
@@ -159,18 +159,26 @@ class DistanceStage(Stage):
             *fields(self.distances, pairs, points=report.two_points, faces=wp.vec2i),
             Array(self.slabs, "states", wp.vec2i, pairs),
             Array(self, "memory", wp.float32, (threads, search_simd.NEAREST_WORDS)),
+            *self._slab_arrays(),
         ]
 
-    def state_arrays(self) -> list[Array]:
-        """Return the slabs."""
-        pool, slabs = self.operator.batch.states.pool, self.slabs
-        states = len(pool.lod)
+    def _slab_arrays(self) -> list[Array]:
+        nodes, states = self._state_rooms()
         return [
-            Array(slabs, "record", wp.vec4, len(pool.node_box) if self.operator.regime.slabs else 0),
-            Array(slabs, "made", wp.vec3i, states, wp.vec3i(-1)),
-            *(Array(slabs, name, wp.int32, states, 0) for name in ("uses", "ended")),
-            Array(slabs, "due", wp.int32, states),
+            Array(self.slabs, "record", wp.vec4, nodes if self.operator.regime.slabs else 0),
+            Array(self.slabs, "made", wp.vec3i, states, wp.vec3i(-1)),
+            *(Array(self.slabs, name, wp.int32, states, 0) for name in ("uses", "ended")),
+            Array(self.slabs, "due", wp.int32, states),
         ]
+
+    def _state_rooms(self) -> tuple[int, int]:
+        """Return how many nodes, and how many tree states there is room for."""
+        pool = self.operator.batch.states.pool
+        return len(pool.node_box), len(pool.lod)
+
+    def fits_states(self) -> bool:
+        """Return whether there are slabs of all nodes."""
+        return self._state_rooms() == self._made_for
 
     def take_tolerances(self, tolerances: tuple[float, float]) -> bool:
         """Take other tolerances, checked, and return whether they are others."""
@@ -180,8 +188,8 @@ class DistanceStage(Stage):
         return True
 
     def link(self):
-        """Forget views of arrays."""
-        self._views = {}
+        """Forget views of arrays, and note what slabs there are."""
+        self._views, self._made_for = {}, self._state_rooms()
 
     def search(self):
         """Find the distances. Launches only."""
@@ -208,11 +216,11 @@ class DistanceStage(Stage):
         operator = self.operator
         if operator.uses_warps() or operator.device.is_capturing:
             return 1
-        return cores_for(len(operator.pairs), PAIRS_A_CORE, len(self.memory))
+        return cores_for(operator.rooms.pairs, PAIRS_A_CORE, len(self.memory))
 
     def _make_crossings(self, launch) -> list:
         """Make the launches that find points of pairs that intersect, see `Commands.find`."""
-        operator, device, room = self.operator, self.operator.device, len(self.operator.pairs)
+        operator, device, room = self.operator, self.operator.device, self.operator.rooms.pairs
         with loading(device, [(kernel, WARP_SIZE) for kernel in CROSSING_KERNELS]):
             pass
         posed = [operator.batch.trees, operator.pair_batch]
@@ -224,7 +232,7 @@ class DistanceStage(Stage):
 
     def _make_inside(self, launch) -> list:
         """Make the launches that report pairs of which one is inside the other."""
-        operator, room, inside = self.operator, len(self.operator.pairs), self._inside
+        operator, room, inside = self.operator, self.operator.rooms.pairs, self._inside
         assert inside is not None and operator.batch.solids is not None
         posed = [operator.batch.trees, operator.pair_batch]
         inputs = [*posed, operator.hits, inside.contained, self.distances]
@@ -238,7 +246,7 @@ class DistanceStage(Stage):
 
     def _make_distances(self, launch) -> list:
         """Make the launches that find distances, after the exact test, see `Commands.find`."""
-        operator, device, room = self.operator, self.operator.device, len(self.operator.pairs)
+        operator, device, room = self.operator, self.operator.device, self.operator.rooms.pairs
         posed, hits, found, slabs = [operator.batch.trees, operator.pair_batch], operator.hits, self.found, self.slabs
         traversal, work = operator.traversal, operator.traversal.work
         if not operator.uses_warps():

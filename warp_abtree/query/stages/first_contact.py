@@ -145,7 +145,7 @@ class FirstContactStage(Stage):
         if operator.device.is_capturing or operator.uses_warps():
             launch()
         else:
-            launch_on_cores(launch, cores_for(len(operator.pairs), PAIRS_A_CORE, len(self.memory)))
+            launch_on_cores(launch, cores_for(operator.rooms.pairs, PAIRS_A_CORE, len(self.memory)))
 
     def _make_motions(self, launch) -> list:
         operator = self.operator
@@ -154,7 +154,7 @@ class FirstContactStage(Stage):
         paths = launch(path.prepare_path_kernel, dim=operator.batch.object_count, inputs=inputs)
         inputs = [operator.batch.trees, self._motions, operator.pair_batch, operator.hits, self.contacts, self.motion]
         starter = start.contact_starter(self._kind)
-        return [paths, launch(starter, dim=len(operator.pairs), inputs=inputs, block_dim=WARP_SIZE)]
+        return [paths, launch(starter, dim=operator.rooms.pairs, inputs=inputs, block_dim=WARP_SIZE)]
 
     def _make_contacts(self, launch) -> list:
         operator, objects, poses = self.operator, self.operator.batch.objects.pool, straight.EndPoses()
@@ -166,7 +166,7 @@ class FirstContactStage(Stage):
             kernel = search.thread_search(self._kind)
             return [launch(kernel, dim=1, inputs=[*inputs, self.memory], device=operator.device)]
         inputs = [operator.traversal.stack_length(), *inputs]
-        threads = {"dim": len(operator.pairs) * operator.lanes, "block_dim": WARP_SIZE, "device": operator.device}
+        threads = {"dim": operator.rooms.pairs * operator.lanes, "block_dim": WARP_SIZE, "device": operator.device}
         return [launch(group.warp_search(self._kind), inputs=inputs, **threads)]
 
     def read(self, found: Found, device: bool, with_rows: bool):

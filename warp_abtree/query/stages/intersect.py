@@ -193,7 +193,7 @@ class GapStage(Stage):
         if self._reach is not None:
             operator = self.operator
             inputs = [operator.pair_batch, self._reach, self._hits.gap]
-            operator.launch_kernel(near_faces.add_reach_kernel, len(operator.pairs), inputs)
+            operator.launch_kernel(near_faces.add_reach_kernel, operator.rooms.pairs, inputs)
 
 
 class InsideStage(Stage):
@@ -222,7 +222,7 @@ class InsideStage(Stage):
         solids: Any = operator.batch.solids
         near_hit = wp.empty(0, dtype=wp.int32, device=operator.device) if near is None else near.any_hit
         inputs = [operator.batch.trees, operator.pair_batch, solids.pool, operator.hits, near_hit, self.contained]
-        dim = {"dim": len(operator.pairs), "block_dim": WARP_SIZE, "device": operator.device}
+        dim = {"dim": operator.rooms.pairs, "block_dim": WARP_SIZE, "device": operator.device}
         prepared = solids.prepare(launch, operator.guard.launched)
         return [prepared, launch(find_contained_kernel, inputs=inputs, **dim)]
 

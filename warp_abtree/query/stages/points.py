@@ -100,7 +100,7 @@ class PointStage(Stage):
     def report(self, count: int | None):
         """Reduce the contacts of the hits in place. Launches only."""
         of, operator, curves, launch = self._contacts, self.operator, self.curves, self.operator.launch_kernel
-        count, room = of.places(count), len(operator.pairs)
+        count, room = of.places(count), operator.rooms.pairs
         gap = operator.hits.gap if self._with_gap else self._no_gap
         posed = [operator.batch.trees, operator.pair_batch]
         start, faces, contacts, sorted_by = of.start, of.faces, of.contacts, (of.order, of.key)
@@ -122,7 +122,7 @@ class PointStage(Stage):
 
     def _spread_points(self, posed):
         """Choose the points of each pair: on CUDA by a warp, of pairs with many contacts by a block. Launches only."""
-        operator, cuda, room = self.operator, self.operator.device.is_cuda, len(self.operator.pairs)
+        operator, cuda, room = self.operator, self.operator.device.is_cuda, self.operator.rooms.pairs
         largest = int(point_kernels.LARGE_PAIR) if cuda else np.iinfo(np.int32).max
         spread = point_kernels.point_spreader(self.point_max)
         operator.launch_warps(spread, room, [largest, *posed, self.curves, self._large, self.manifolds])
@@ -153,7 +153,7 @@ class PointStage(Stage):
         if solids is not None:
             inputs = [operator.traversal.stack_length(), operator.batch.trees, solids.pool, operator.pair_batch]
             inputs += [operator.hits, self.manifolds]
-            operator.launch_warps(inside_points.add_inside_point_kernel, len(operator.pairs), inputs)
+            operator.launch_warps(inside_points.add_inside_point_kernel, operator.rooms.pairs, inputs)
 
     def _sort_keys(self, count, bits):
         with wp.ScopedDevice(self.operator.device):

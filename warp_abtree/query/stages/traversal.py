@@ -97,7 +97,7 @@ class Traversal:
 
     def warp_count(self) -> int:
         """Return the warps of a launch: more than units, where these are few, so that some wait for donations."""
-        device, room = self.operator.device, len(self.operator.pairs)
+        device, room = self.operator.device, self.operator.rooms.pairs
         if not device.is_cuda:
             return 1
         warps = max(room, int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1)
@@ -116,7 +116,7 @@ class Traversal:
         # A further core costs some 50 us: many pairs of "any"; else a pair in contact takes the root of its faces.
         least = 32 if self._is_any else max(1, int(50 / math.sqrt(operator.batch.mean_faces)))
         # Each has memory for slabs: tests do not depend on which thread takes a pair.
-        return cores_for(len(operator.pairs), least, len(self.slab_memory))
+        return cores_for(operator.rooms.pairs, least, len(self.slab_memory))
 
     def launch(self, name: str, within: wp.array, hits, mode: int, output: int):
         """Launch relative poses, the traversal, and passes over uncertain face pairs.
@@ -156,7 +156,7 @@ class Traversal:
         # A warp a block: few pairs lie on as many multiprocessors.
         first = launch(
             relative_pose.relative_poses(len(within) > 0),
-            dim=max(len(operator.pairs), len(self.work.flag)),
+            dim=max(operator.rooms.pairs, len(self.work.flag)),
             inputs=[output, posed[0], within, posed[1], hits, self.work],
             block_dim=WARP_SIZE,
             device=device,
