@@ -105,11 +105,6 @@ class Timer:
             self.clock.charge(**count())
         self._read()
 
-    def close(self, stage: str):
-        """End a stage, unless it was the last that ended."""
-        if self.marks[-1] != stage:
-            self.mark(stage)
-
     def _read(self):
         if not self.uses_events:
             wp.synchronize_device(self.device)

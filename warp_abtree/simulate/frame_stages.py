@@ -34,16 +34,13 @@ class FrameStages:
     """Selection, LOD update, poses, broad and narrow phase, and the response of rigid bodies: launches, in this order.
 
     Args:
-        scene: `Scene` with all its objects.
         motion: As for `Frame`.
         controller: `Controller` that selects LODs, or None.
         output: Output of the query where no rigid bodies ask for contacts.
-        time_step: Time between frames [s].
         mark: Called as mark(stage, count) when the launches of a stage are over; count() returns its counted work.
 
     Attributes:
-        query: The query of the frame.
-        grow, result: Functions that find with room for all that is found, and read it; both wait for the device.
+        grow, result: Functions of the query, to find with room for all, and to read it; both wait for the device.
         table: `LodColumns` of the levels of the controller; None without.
         answer: The motion's own response, or None.
         seen: Frames that the device has counted, up to the last one recorded.
@@ -63,13 +60,13 @@ class FrameStages:
         if self._dynamics is None:
             contacts = output == "contacts"
             query: Any = ContactQuery(scene, sort_pairs=True) if contacts else Query(scene, output, sort_pairs=True)
-            self.query, query.growth = query, 2
+            query.growth = 2
             self.result, self.grow, guards = query.result, query.grow, [query.guard]
         else:
             query = self._dynamics.query
-            self.query = query
             self.result, self.grow = partial(query.result, with_points=False), self._dynamics.find_contacts
             guards = [part.guard for part in (query, self._dynamics.certified) if part is not None]
+        self.query = query
         self._guards, self._filter = guards, self.batch.filter_generation.number
         zeros = partial(wp.zeros, device=self.device)
         self._levels: Any = None
