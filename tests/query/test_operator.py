@@ -1,0 +1,87 @@
+"""Operators of stages: a stage of one's own, room that grows, and graphs of scenes that change."""
+
+import numpy as np
+import pytest
+import warp as wp
+from helpers.faults import MORE_PAIRS, add_objects, check_buffer_lengths
+from helpers.samples import random_poses, sample
+
+import warp_abtree as ab
+from warp_abtree.query.operator import Operator
+from warp_abtree.query.stage import Array, Stage
+from warp_abtree.query.stages.intersect import InsideStage, IntersectStage
+
+
+@wp.kernel
+def count_per_object_kernel(
+    pair_count: wp.array[int], pairs: wp.array[wp.vec2i], hits: wp.array[int], count: wp.array[int]
+):
+    p = wp.tid()
+    if p < pair_count[0] and hits[p] != 0:
+        wp.atomic_add(count, pairs[p][0], 1)
+        wp.atomic_add(count, pairs[p][1], 1)
+
+
+class TouchingStage(Stage):
+    """Count the pairs that each object intersects in, for each of a pair's room a place that says so."""
+
+    def arrays(self, rooms):
+        count = Array(self, "count", wp.int32, self.operator.batch.object_count, 0)
+        return [count, Array(self, "place", wp.float64, (rooms.pairs, 3), 7.0)]
+
+    def link(self):
+        self.linked = self.place
+
+    def report(self, count):
+        operator = self.operator
+        self.count.zero_()
+        inputs = [operator.pair_count, operator.pairs, operator.hits.any_hit, self.count]
+        operator.launch_kernel(count_per_object_kernel, operator.rooms.pairs, inputs)
+
+    def read(self, found, device, with_rows):
+        found.points = self.count.numpy()
+
+
+@pytest.mark.parametrize("pairs", [None, MORE_PAIRS])
+def test_a_stage_of_ones_own(device, pairs):
+    """It is launched after the search, again where room for pairs was lacking, and captured with the rest."""
+    scene = add_objects(device)
+    query = Operator(scene, [IntersectStage(), InsideStage(), TouchingStage()], pairs, ab.Buffers(pairs=1))
+    expected = scene.intersect(pairs)
+    if pairs is not None:
+        assert query.rooms.pairs == len(pairs)
+    result = query.run()
+    touching = np.bincount(result.pairs[result.any].ravel(), minlength=scene.object_count)
+    assert result.any.sum() == expected.any.sum() > 0
+    np.testing.assert_array_equal(result.points, touching)
+    (stage,) = query.stages[2:]
+    assert (
+        stage.linked is stage.place and stage.place.shape == (query.rooms.pairs, 3) and (stage.place.numpy() == 7).all()
+    )
+    check_buffer_lengths([query])
+    with wp.ScopedCapture(device) as capture:
+        query.launch()
+    stage.count.zero_()
+    wp.capture_launch(capture.graph)
+    np.testing.assert_array_equal(query.result().points, touching)
+
+
+def test_a_captured_query_of_solids_follows_lods(device):
+    """Room for the components of solids is no reason to point objects at states anew, which a graph would not see."""
+    rng, scene = np.random.default_rng(3), ab.Scene(device)
+    for i in range(12):
+        scene.add(sample("torus" if i % 2 else "small ball"), random_poses(rng, 1, 0.5)[0], solid=i % 2 == 1)
+    most = np.array([scene.models[m].lod_max for m in scene.object_model])
+    pairs = np.array([(i, j) for i in range(12) for j in range(i)])
+    query = ab.Query(scene, "count", pairs=pairs)
+    query.run()
+    scene.set_lods(rng.integers(0, most + 1))
+    query.run()
+    with wp.ScopedCapture(device) as capture:
+        query.launch()
+    for fraction in (0.5, 0.2, 0.0):
+        scene.set_lods((fraction * most).astype(int))
+        wp.capture_launch(capture.graph)
+        found, fresh = query.result(), ab.Query(scene, "count", pairs=pairs).run()
+        np.testing.assert_array_equal(found.count, fresh.count)
+        np.testing.assert_array_equal(found.any, fresh.any)
