@@ -168,4 +168,4 @@ def test_requests(device, monkeypatch, kind, asked, pairs):
         return check_scene(untouched, scene)
 
     count, result = fault.everywhere(make, lambda scene: scene.intersect(pairs, **options), check)
-    assert count > 4 and result.any.any()
+    assert count >= 4 and result.any.any()
