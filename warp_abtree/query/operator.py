@@ -55,6 +55,7 @@ class Operator(DeviceMemory):
         hits: Device arrays of the last launch, `kernels.intersect.face_pairs.Hits`.
         counts: Counters of `hits`, device int64; rows: count, then `COUNTERS`.
         traversal: `Traversal` of the hits, which stages share.
+        lists_hits: Whether a result has the hits as rows, which are sorted while the host still launches.
         given: Pairs on the host, int32 (p, 2), unless the broad phase finds them.
         commands, guard: Its recorded launches, and what became of them.
         growth: Room that `run` makes, over the demand.
@@ -66,6 +67,7 @@ class Operator(DeviceMemory):
     hits: Any
     counts: wp.array
     traversal: Any
+    lists_hits = False
     given: Any = None
 
     def __init__(self, scene, stages: list[Stage], pairs=None, capacity=None, output="any", sort_pairs=False):

@@ -47,13 +47,11 @@ class Readout:
 
     Attributes:
         staging: `Staging`, made at the first use.
-        lists_hits: Whether a result has the hits as rows, which are sorted while the host still launches.
     """
 
     def __init__(self, operator: Any):
         self.operator, self.device = operator, operator.device
         self.packs = operator.regime.packs(self.device)
-        self.lists_hits = operator.output == "faces"
         self._views: HostViews | None = None
         self._last_read = 0, 0  # pairs of the last result, and its hits
 
@@ -170,7 +168,7 @@ class Readout:
         So the device sorts them while the host still launches, and a loop over poses waits once a call.
         """
         pairs, hits = self._last_read
-        if not self.lists_hits or pairs != n or hits == 0:
+        if not self.operator.lists_hits or pairs != n or hits == 0:
             return 0
         # A little more, in steps, so that hits that vary find room and launches stay the same.
         expected = min(-(-hits * 17 // 16 // ROWS_STEP) * ROWS_STEP, self.operator.rooms.hits)

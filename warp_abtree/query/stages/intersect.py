@@ -74,7 +74,7 @@ class IntersectStage(HitStage):
             self.hits.apart_total = wp.zeros(1, dtype=wp.int32, device=operator.device)
         self.traversal = Traversal(operator, self._output == int(face_pairs.OUTPUT_ANY))
         self._no_distance = wp.empty(0, dtype=wp.float64, device=operator.device)
-        operator.hits, operator.traversal = self.hits, self.traversal
+        operator.hits, operator.traversal, operator.lists_hits = self.hits, self.traversal, self._reads
 
     def kernels(self, device) -> list:
         """Return the kernels of the traversal."""
