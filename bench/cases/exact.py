@@ -21,6 +21,7 @@ from warp_abtree.testing import (
     UNCERTAIN,
     decide_triangles,
     float32_filter_triangles,
+    kernel_options,
 )
 
 from ..shapes import knot, pair_poses, scene_of_pairs
@@ -28,7 +29,7 @@ from ..timing import ratio_of, summarise, time_in_turn
 from ..triangle_pairs import ADVERSARIAL, make_chunk
 from ..verify import count_differences, load_oracle
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = kernel_options("exact/determinant.cuh")
 PRECISIONS = ("exact", "float32")
 FULL = {"faces": 5000, "pairs": 256, "coincident": 16, "repeats": 11}
 QUICK = {"faces": 300, "pairs": 3, "coincident": 1, "repeats": 1}

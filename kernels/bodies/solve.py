@@ -5,13 +5,14 @@ Pairs of one color share no dynamic body, so one thread for all of them and a th
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.lanes import block_sync
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, Bodies
 from warp_abtree.kernels.bodies.constraints import Constraints, point_velocity
 from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT
 from warp_abtree.kernels.contacts.manifold import Manifolds
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options())
 
 WARM_START = wp.constant(0)
 VELOCITY = wp.constant(1)

@@ -10,7 +10,7 @@ from warp_abtree.kernels.build.heap import Heap, heap_drop_top, heap_push, pack_
 from warp_abtree.kernels.build.quadric import Quadric, quadric_error, quadric_minimum, quadric_moved, quadric_plane
 from warp_abtree.kernels.build.vertex_forest import Rings, absorb_ring, are_distinct, count_dying, face_corners, third_corner, third_vertices_live
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(native.options("build/fetch_edges.h") | {"fuse_fp": True})
 
 RUNNING = wp.constant(0)
 FINISHED = wp.constant(1)
@@ -53,7 +53,7 @@ class Placement:
     cost: wp.float64  # quadric error there
 
 
-@wp.func_native(native.body("build/fetch_edges.h", "fetch_edges"))
+@native.func_native(cpu=True)
 def fetch_edges(surface: Surface, rings: Rings, heap: Heap, size: wp.int32):
     """Prefetch what the next merges will read into the caches of this core."""
 

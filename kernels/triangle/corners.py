@@ -37,7 +37,7 @@ def load_triangles(models: ModelPool, states: StatePool, pose: PairPose, face_a:
     return scale_triangles(a0, a1, a2, b0, b1, b2)
 
 
-@wp.func_native(native.body("base/numbers.cuh", "load_corner"))
+@native.func_native()
 def load_corner(corners: wp.array(dtype=wp.vec4i), i: wp.int32) -> wp.vec4i: ...
 
 

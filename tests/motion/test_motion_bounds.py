@@ -12,6 +12,7 @@ from oracles.path import HAS_LONG, LONG, apply, frames_at, move, seen_from, shor
 from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import place_trees
@@ -43,7 +44,7 @@ class Seen:
     box_b: MovingBox
 
 
-@wp.kernel(module="unique", module_options={"fuse_fp": False})
+@wp.kernel(module="unique", module_options=native.options())
 def see_kernel(
     paths: Paths,
     models: ModelPool,

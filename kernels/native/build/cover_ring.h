@@ -4,12 +4,8 @@
 #include "build/polygon_cuts.h"
 
 template <class Replay, class Covers>
-wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge, wp::int32 near_count, wp::int32 begin,
-                     wp::int32 end, wp::float64 limit) {
-#if defined(__CUDA_ARCH__)
-    __trap();  // models are built on the host
-#else
-#include "build/polygon_cuts.h"
+wp::int32 cover_ring(const Replay& replay, const Covers& covers, wp::vec_t<3, wp::int32> merge, wp::int32 near_count,
+                     wp::int32 begin, wp::int32 end, wp::float64 limit) {
     typedef FaceLanes::lanes lanes;
     if (near_count > NEAR_ROOM)
         return begin;
@@ -141,6 +137,5 @@ wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge
             found[k] = near.face[used[k]];
         covers.limit.data[row] = limit;
     }
-#endif
     return end;
 }

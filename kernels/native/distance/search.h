@@ -6,16 +6,9 @@
 #include "distance/memory.h"
 
 template <class ModelPool, class StatePool, class PairPose, class SearchScale, class Slabs>
-wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairPose pose, SearchScale scaling,
-                                       wp::vec_t<4, wp::float32> terms, Slabs slabs, bool with_slabs, wp::int32 thread,
-                                       wp::array_t<wp::float32> memory) {
-#if defined(__CUDA_ARCH__)
-    __trap();  // warps have a search of their own
-    return wp::vec_t<3, wp::int32>();
-#else
-#include "distance/boxes.h"
-#include "distance/corners32.h"
-#include "distance/memory.h"
+wp::vec_t<3, wp::int32> search_nearest(const ModelPool& models, const StatePool& states, const PairPose& pose,
+                                       const SearchScale& scaling, wp::vec_t<4, wp::float32> terms, const Slabs& slabs,
+                                       bool with_slabs, wp::int32 thread, wp::array_t<wp::float32> memory) {
     typedef NearestFaces N;
     typedef N::F F;
     const NearestMemory m = NearestMemory::find(memory.data, thread);
@@ -156,5 +149,4 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     h.waiting = waiting;
     h.node_tests = node_tests;
     return wp::vec_t<3, wp::int32>(0, node_tests, h.face_tests);
-#endif
 }

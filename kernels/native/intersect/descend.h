@@ -4,13 +4,10 @@
 #include "base/sizes.h"
 
 template <class StatePool, class PairPose>
-wp::vec_t<3, wp::int64> descend(StatePool states, PairPose pose, wp::int32 at_once, wp::int32 ready, wp::int64 most,
-                                wp::int32 top, wp::array_t<wp::int64> stack, wp::array_t<wp::int64> faces) {
+wp::vec_t<3, wp::int64> descend(const StatePool& states, const PairPose& pose, wp::int32 at_once, wp::int32 ready,
+                                wp::int64 most, wp::int32 top, wp::array_t<wp::int64> stack,
+                                wp::array_t<wp::int64> faces) {
     wp::vec_t<3, wp::int64> result;
-#if defined(__CUDA_ARCH__)
-    __trap();  // warps have a traversal of their own
-#else
-#include "base/sizes.h"
     // Groups of four numbers: x, y, z and one that is not in use.
     typedef float groups __attribute__((vector_size(64)));
     typedef float loose __attribute__((vector_size(64), aligned(16)));
@@ -134,13 +131,11 @@ wp::vec_t<3, wp::int64> descend(StatePool states, PairPose pose, wp::int32 at_on
     result[0] = end;
     result[1] = waiting;
     result[2] = compared;
-#endif
     return result;
 }
 
-wp::vec_t<2, wp::int32> move_below(wp::vec_t<2, wp::int32> floors, wp::int32 top, wp::array_t<wp::int64> stack,
-                                   wp::array_t<wp::int64> below) {
-#include "base/sizes.h"
+inline wp::vec_t<2, wp::int32> move_below(wp::vec_t<2, wp::int32> floors, wp::int32 top, wp::array_t<wp::int64> stack,
+                                          wp::array_t<wp::int64> below) {
     // Whether a node, or both children of one, lie in a subtree whose root is on a level.
     auto is_below = [](unsigned int half, int floor) {
         return 31 - __builtin_clz(half & 0x7fffffff) - (int)(half >> 31) >= floor;

@@ -2,10 +2,9 @@
 // those to be measured in float64, each with a bound of its distance.
 #pragma once
 #include "builtin.h"
-#include "base/sizes.h"
+#include "search/warp_stack.cuh"
 
 inline CUDA_CALLABLE wp::uint64 nearest_stack() {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     __shared__ long long items[NEAREST_LENGTH + NEAREST_LENGTH / 2];
     return __cvta_generic_to_shared(items);
@@ -20,7 +19,6 @@ inline CUDA_CALLABLE wp::uint64 thread_lists(wp::array_t<wp::int64> memory, wp::
 }
 
 inline CUDA_CALLABLE wp::float32 read_bound(wp::uint64 items, wp::int32 i) {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     float bound;
     asm volatile("ld.shared.f32 %0, [%1];"
@@ -34,7 +32,6 @@ inline CUDA_CALLABLE wp::float32 read_bound(wp::uint64 items, wp::int32 i) {
 }
 
 inline CUDA_CALLABLE void write_bound(wp::uint64 items, wp::int32 i, wp::float32 bound) {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * i), "f"(bound)
                  : "memory");
@@ -46,7 +43,6 @@ inline CUDA_CALLABLE void write_bound(wp::uint64 items, wp::int32 i, wp::float32
 inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp::int32 leaf_end,
                                             wp::vec_t<4, wp::int32> kinds, wp::vec_t<4, wp::int64> children,
                                             wp::vec_t<4, wp::float32> bounds) {
-#include "base/sizes.h"
     // The nearest of each lane comes last, so that it is taken first.
     int order[5][2] = {{0, 1}, {2, 3}, {0, 2}, {1, 3}, {1, 2}};
 #pragma unroll
@@ -92,7 +88,6 @@ inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp:
 
 inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp::vec_t<4, wp::int32> kinds,
                                              wp::vec_t<4, wp::int64> children) {
-#include "base/sizes.h"
     const int mine = (kinds[0] != 0) + (kinds[1] != 0) + (kinds[2] != 0) + (kinds[3] != 0);
 #if defined(__CUDA_ARCH__)
     int sum = mine;
@@ -126,7 +121,6 @@ inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp
 
 inline CUDA_CALLABLE wp::int32 push_open(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item,
                                          wp::float32 bound) {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     const unsigned int votes = __ballot_sync(0xffffffffu, flag);
     const int at = NEAREST_OPEN_START + end + __popc(votes & ((1u << threadIdx.x) - 1u));

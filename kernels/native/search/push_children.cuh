@@ -6,7 +6,6 @@
 inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp::vec_t<3, wp::int32> ends,
                                                            wp::vec_t<4, wp::int32> lists,
                                                            wp::vec_t<4, wp::int64> children) {
-#include "base/sizes.h"
     const int end = ends[0], slab_end = ends[1], leaf_end = ends[2];
 #if defined(__CUDA_ARCH__)
     unsigned int emitted[4];

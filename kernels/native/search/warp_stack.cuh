@@ -4,7 +4,6 @@
 #include "base/sizes.h"
 
 inline CUDA_CALLABLE wp::uint64 warp_stack() {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     __shared__ long long items[SLAB_PAIR_START + SLAB_PAIR_LENGTH];
     // Through another lane, so that the address is held and not computed again at every use.
@@ -34,7 +33,6 @@ inline CUDA_CALLABLE void write_item(wp::uint64 items, wp::int32 i, wp::int64 it
 }
 
 inline CUDA_CALLABLE wp::int32 push_items(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item) {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     const unsigned int votes = __ballot_sync(0xffffffffu, flag);
     const unsigned int at = (end + __popc(votes & ((1u << threadIdx.x) - 1u))) & (STACK_LENGTH - 1);
@@ -51,7 +49,6 @@ inline CUDA_CALLABLE wp::int32 push_items(wp::uint64 items, wp::int32 end, bool 
 
 inline CUDA_CALLABLE wp::int32 push_straddling(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item,
                                                wp::int32 signs) {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     const unsigned int votes = __ballot_sync(0xffffffffu, flag);
     const unsigned int at = end + __popc(votes & ((1u << threadIdx.x) - 1u)), start = items;
@@ -71,7 +68,6 @@ inline CUDA_CALLABLE wp::int32 push_straddling(wp::uint64 items, wp::int32 end, 
 }
 
 inline CUDA_CALLABLE wp::int32 read_signs(wp::uint64 items, wp::int32 i) {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     int signs;
     asm volatile("ld.shared.b32 %0, [%1];"
@@ -85,7 +81,6 @@ inline CUDA_CALLABLE wp::int32 read_signs(wp::uint64 items, wp::int32 i) {
 }
 
 inline CUDA_CALLABLE wp::uint64 signed_pairs() {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     __shared__ int4 items[RESOLVE_WARPS * STRADDLING_LENGTH];
     return __cvta_generic_to_shared(items + (threadIdx.x >> 5) * STRADDLING_LENGTH);

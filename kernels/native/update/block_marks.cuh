@@ -4,7 +4,6 @@
 #include "base/sizes.h"
 
 inline CUDA_CALLABLE wp::uint64 block_marks(wp::array_t<wp::uint32> scratch) {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     __shared__ unsigned int words[MARK_WORDS];
     return (unsigned int)__cvta_generic_to_shared(words);
@@ -14,7 +13,6 @@ inline CUDA_CALLABLE wp::uint64 block_marks(wp::array_t<wp::uint32> scratch) {
 }
 
 inline CUDA_CALLABLE wp::uint64 shallow_marks(wp::array_t<wp::uint32> scratch) {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     __shared__ unsigned int words[SHALLOW_WORDS];
     return (unsigned int)__cvta_generic_to_shared(words);
