@@ -2,6 +2,7 @@
 #pragma once
 #include "builtin.h"
 #include "base/sizes.h"
+#include "search/siblings.h"
 
 template <class StatePool, class PairPose>
 wp::vec_t<3, wp::int64> descend(const StatePool& states, const PairPose& pose, wp::int32 at_once, wp::int32 ready,
@@ -52,15 +53,10 @@ wp::vec_t<3, wp::int64> descend(const StatePool& states, const PairPose& pose, w
     wp::int64* found = faces.data;
     wp::int64 compared = 0;
     int end = top, waiting = 0;
-    // Siblings lie side by side, so an item loads both, and names those of the four pairs that are in use: of two
-    // siblings the first (even), the second (odd) or both (s), in A, times the same in B. Four bits for each choice,
-    // by the item's bits that say so, from the highest: A is odd, s of B, B is odd, s of A.
-    constexpr unsigned long long PAIRS_USED = 0xfcfca854f3f3a251;
     auto take = [&](wp::int64 item) {
         const unsigned int x = (unsigned int)(item >> 32), y = (unsigned int)item;
-        const unsigned long long turned = ((unsigned long long)item << 1) | ((unsigned long long)item >> 63);
         const Taken taken = {tree_a + 32 * (wp::int64)(x & 0x7ffffffe), tree_b + 32 * (wp::int64)(y & 0x7ffffffe),
-                             (unsigned int)(PAIRS_USED >> (((turned & 3) << 2) | ((turned >> 28) & 48))) & 15};
+                             pairs_in_use(item)};
         __builtin_prefetch(taken.a);
         __builtin_prefetch(taken.b);
         return taken;

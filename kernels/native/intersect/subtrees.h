@@ -2,6 +2,7 @@
 #pragma once
 #include "builtin.h"
 #include "intersect/slabs.h"
+#include "search/siblings.h"
 
 template <class ModelPool, class StatePool, class PairPose>
 wp::vec_t<3, wp::int64> descend_subtrees(const ModelPool& models, const StatePool& states, const PairPose& pose,
@@ -46,7 +47,6 @@ wp::vec_t<3, wp::int64> descend_subtrees(const ModelPool& models, const StatePoo
         const Record *a, *b;
         unsigned int used;
     };
-    constexpr unsigned long long PAIRS_USED = 0xfcfca854f3f3a251;
     // The records of two siblings; null if their subtree takes the place of another one while items wait.
     auto find = [&](const Slabs::Side& side, unsigned int half, bool wait) -> const Record* {
         const unsigned int node = half & 0x7fffffff;
@@ -69,7 +69,6 @@ wp::vec_t<3, wp::int64> descend_subtrees(const ModelPool& models, const StatePoo
         int count = 0;
         for (; count < wanted; ++count) {
             const wp::int64 item = items[end - 1 - count];
-            const unsigned long long turned = ((unsigned long long)item << 1) | ((unsigned long long)item >> 63);
             const Record* a = find(sides[0], (unsigned int)(item >> 32), count > 0);
             if (a == nullptr)
                 break;
@@ -80,8 +79,7 @@ wp::vec_t<3, wp::int64> descend_subtrees(const ModelPool& models, const StatePoo
                 __builtin_prefetch(a + k);
                 __builtin_prefetch(b + k);
             }
-            taken[count] =
-                Taken{a, b, (unsigned int)(PAIRS_USED >> (((turned & 3) << 2) | ((turned >> 28) & 48))) & 15};
+            taken[count] = Taken{a, b, pairs_in_use(item)};
         }
         end -= count;
         for (int i = 0; i < count; ++i) {

@@ -1,6 +1,7 @@
 // Places of the items that node pair tests emit: one prefix sum over a warp for three lists.
 #pragma once
 #include "builtin.h"
+#include "base/shared.cuh"
 #include "base/sizes.h"
 
 inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp::vec_t<3, wp::int32> ends,
@@ -31,10 +32,8 @@ inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp:
     for (int k = 0; k < 4; ++k) {
         unsigned int at;
         asm("shr.u32 %0, %1, %2;" : "=r"(at) : "r"(place), "r"(lists[k]));
-        asm volatile(
-            "{ .reg .pred used; setp.ne.u32 used, %0, 0; @used st.shared.v2.b32 [%1], {%2, %3}; }" ::"r"(emitted[k]),
-            "r"((unsigned int)items + (at & PLACE_MASK)), "r"((int)children[k]), "r"((int)(children[k] >> 32))
-            : "memory");
+        if (emitted[k] != 0)
+            *(volatile long long*)entry<char>(items, at & PLACE_MASK) = children[k];
         place += emitted[k];
     }
     const int more_items = (total >> STACK_LIST) / ITEM_BYTES;
