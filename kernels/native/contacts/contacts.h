@@ -3,28 +3,29 @@
 #include "builtin.h"
 #include "contacts/near64.h"
 
-template <class ModelPool, class StatePool, class PairPose, class Contacts>
-wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const PairPose& pose,
-                        wp::mat_t<3, 3, wp::float64> rotation, wp::vec_t<3, wp::float64> position, bool proven,
-                        wp::vec_t<3, wp::int32> span, wp::array_t<wp::vec_t<3, wp::int32>> faces,
-                        wp::array_t<wp::int32> place, const Contacts& contacts) {
-#pragma clang fp contract(off)
-    wp::int32 result = 0;
+// Finds contacts of up to 8 face pairs at a time.
+template <class PairPose, class Contacts>
+struct ContactFinder {
     typedef Contact64 C;
     typedef Float64 F;
     typedef F::bits bits;
     typedef F::lanes lanes;
     typedef F::Point Point;
-    const double* vertices = (const double*)models.vertex_pos.data;
-    const wp::vec_t<4, wp::int32>* corners = states.face_corner.data;
-    const bool with_gap = contacts.separation.shape[0] != 0, back = pose.swapped != 0;
-    wp::vec_t<3, wp::float64>* target[5] = {contacts.p0.data, contacts.p1.data, contacts.normal_a.data,
-                                            contacts.normal_b.data, contacts.normal.data};
+    const PairPose& pose;
+    const Contacts& contacts;
+    const wp::mat_t<3, 3, wp::float64>& rotation;
+    const wp::vec_t<3, wp::float64>& position;
+    const wp::vec_t<3, wp::int32>* faces;
+    const double* vertices;
+    const wp::vec_t<4, wp::int32>* corners;
+    bool proven, with_gap, back;
+    wp::vec_t<3, wp::float64>* target[5];
+
     // Corners of so many face pairs, in A's frame.
-    auto load = [&](const int* hit, int count, Point(&a)[3], Point(&b)[3]) {
+    void load(const int* hit, int count, Point (&a)[3], Point (&b)[3]) const {
         int start[6][8];
         for (int k = 0; k < 8; ++k) {
-            const wp::vec_t<3, wp::int32>& pair = faces.data[hit[k < count ? k : 0]];
+            const wp::vec_t<3, wp::int32>& pair = faces[hit[k < count ? k : 0]];
             const wp::vec_t<4, wp::int32>& a = corners[pose.corner_a + pair[back ? 2 : 1]];
             const wp::vec_t<4, wp::int32>& b = corners[pose.corner_b + pair[back ? 1 : 2]];
             for (int i = 0; i < 3; ++i) {
@@ -36,8 +37,8 @@ wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const 
             a[i] = F::gather(vertices, start[i]);
             b[i] = C::pose(pose.rotation.data, pose.translation, F::gather(vertices, start[3 + i]));
         }
-    };
-    auto store = [&](const int* hit, int count, const Point(&found)[5]) {
+    }
+    void store(const int* hit, int count, const Point (&found)[5]) const {
         if (count == 8 && hit[7] - hit[0] == 7) {
             for (int i = 0; i < 5; ++i)
                 C::store((double*)(target[i] + hit[0]), found[i]);
@@ -52,9 +53,9 @@ wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const 
         }
         for (int k = 0; k < count; ++k)
             contacts.coplanar.data[hit[k]] = 0;
-    };
+    }
     // Those of faces that are apart; what it is not sure of keeps its mark.
-    auto find_near = [&](const int* hit, int count) {
+    void find_near(const int* hit, int count) const {
         Point a[3], b[3], of_b[3];
         load(hit, count, a, b);
         for (int i = 0; i < 3; ++i)
@@ -76,9 +77,9 @@ wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const 
         const lanes separation = open ? lanes{} : C::root(near.square) * t.size;
         for (int k = 0; k < count; ++k)
             contacts.separation.data[hit[k]] = separation[k] > LEAST_SEPARATION ? separation[k] : LEAST_SEPARATION;
-    };
+    }
     // So many face pairs; returns those that it is not sure of, a bit each.
-    auto find = [&](bool extends, const int* hit, int count) {
+    unsigned int find(bool extends, const int* hit, int count) const {
         Point a[3], b[3], d[3][3];
         load(hit, count, a, b);
         // From each corner of A to each of B: the other way round, every rounding is the same.
@@ -135,7 +136,28 @@ wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const 
               {F::choose(turned, p1, p0), F::choose(turned, p0, p1), back ? normal_b : normal_a,
                back ? normal_a : normal_b, back ? C::negate(normal) : normal});
         return F::to_mask(open) & ((1u << count) - 1);
-    };
+    }
+};
+
+template <class ModelPool, class StatePool, class PairPose, class Contacts>
+wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const PairPose& pose,
+                        wp::mat_t<3, 3, wp::float64> rotation, wp::vec_t<3, wp::float64> position, bool proven,
+                        wp::vec_t<3, wp::int32> span, wp::array_t<wp::vec_t<3, wp::int32>> faces,
+                        wp::array_t<wp::int32> place, const Contacts& contacts) {
+#pragma clang fp contract(off)
+    const bool with_gap = contacts.separation.shape[0] != 0;
+    const ContactFinder<PairPose, Contacts> finder = {
+        pose,
+        contacts,
+        rotation,
+        position,
+        faces.data,
+        (const double*)models.vertex_pos.data,
+        states.face_corner.data,
+        proven,
+        with_gap,
+        pose.swapped != 0,
+        {contacts.p0.data, contacts.p1.data, contacts.normal_a.data, contacts.normal_b.data, contacts.normal.data}};
     // First without double words, then with them those that need them, side by side: on the list, which they leave.
     int* list = place.data + span[2];
     int from = span[0], count = 0, apart = 0, left = 0, hit[8], near[8];
@@ -145,21 +167,21 @@ wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const 
         else
             near[apart++] = from;
         if (apart == 8 || (apart > 0 && from + 1 == span[1])) {
-            find_near(near, apart);
+            finder.find_near(near, apart);
             apart = 0;
         }
         if (count == 8 || (count > 0 && from + 1 == span[1])) {
-            for (unsigned int open = find(false, hit, count); open != 0; open &= open - 1)
+            for (unsigned int open = finder.find(false, hit, count); open != 0; open &= open - 1)
                 list[left++] = hit[__builtin_ctz(open)];
             count = 0;
         }
     }
-    result = span[2];
+    wp::int32 result = span[2];
     for (int i = 0; i < left; i += 8) {
         count = left - i < 8 ? left - i : 8;
         for (int k = 0; k < count; ++k)
             hit[k] = list[i + k];
-        for (unsigned int open = find(true, hit, count); open != 0; open &= open - 1)
+        for (unsigned int open = finder.find(true, hit, count); open != 0; open &= open - 1)
             place.data[result++] = hit[__builtin_ctz(open)];
     }
     return result;
