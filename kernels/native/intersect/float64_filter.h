@@ -21,7 +21,7 @@ struct Float64Filter {
     const double *position, *corners;
 
     // As `pose_point`.
-    Point gather_posed(const int* start) const {
+    __attribute__((always_inline)) Point gather_posed(const int* start) const {
         const Point p = F::gather(position, start);
         const auto& r = pose.rotation.data;
         const auto& t = pose.translation;
@@ -33,7 +33,7 @@ struct Float64Filter {
         return Point{x[0], x[1], x[2]};
     }
     // Where the corners' numbers start, of A and of B, of so many pairs of faces.
-    void find_corners(const wp::int64* items, int count, ids (&start)[6]) const {
+    __attribute__((always_inline)) void find_corners(const wp::int64* items, int count, ids (&start)[6]) const {
         const bits some = bits{} + items[0];
         for (int i = 0; i < count; i += 8) {
             const bits lane = {0, 1, 2, 3, 4, 5, 6, 7};
@@ -59,8 +59,9 @@ struct Float64Filter {
         }
     }
     // Up to 8 straddling pairs from one on, which two more signs decide.
-    void order_ends(const ids (&rotated)[6], const wp::int64* straddling, int first, int count, wp::int64* hits,
-                    int& met, wp::int64* rest, int& open) const {
+    __attribute__((always_inline)) void order_ends(const ids (&rotated)[6], const wp::int64* straddling, int first,
+                                                   int count, wp::int64* hits, int& met, wp::int64* rest,
+                                                   int& open) const {
         const Point p1 = F::gather(position, rotated[0] + first), q1 = F::gather(position, rotated[1] + first);
         const Point r1 = F::gather(position, rotated[2] + first), p2 = gather_posed(rotated[3] + first);
         const Point q2 = gather_posed(rotated[4] + first), r2 = gather_posed(rotated[5] + first);
@@ -79,7 +80,8 @@ struct Float64Filter {
             rest[open++] = straddling[first + __builtin_ctz(inexact)];  // `append` could write over unread items
     }
     // From each corner of A to each of B: the other way round, every rounding is the same.
-    void find_differences(const ids (&start)[6], int at, Point (&d)[3][3], Point (&size)[3][3]) const {
+    __attribute__((always_inline)) void find_differences(const ids (&start)[6], int at, Point (&d)[3][3],
+                                                         Point (&size)[3][3]) const {
         const Point a[3] = {F::gather(position, start[0] + at), F::gather(position, start[1] + at),
                             F::gather(position, start[2] + at)};
         const Point b[3] = {gather_posed(start[3] + at), gather_posed(start[4] + at), gather_posed(start[5] + at)};

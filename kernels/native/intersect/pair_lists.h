@@ -1,5 +1,4 @@
-// What follows in the CPU's traversals from four pairs of nodes that may intersect: node pairs on a stack, face pairs
-// on a list.
+// Lists of the CPU's traversals: of node pairs and face pairs that follow from four pairs of nodes that may intersect.
 #pragma once
 #include "builtin.h"
 #include "base/sizes.h"
