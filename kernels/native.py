@@ -15,7 +15,7 @@ import warp as wp
 
 FOLDER = Path(__file__).parent / "native"
 INCLUDE = re.compile(r'^#(?:pragma once|include "(.+)")\n', re.M)
-BASE = ("base/numbers.cuh", "base/lanes.cuh", "base/counters.cuh")  # what most kernels call
+BASE = ("base/numbers.cuh",)  # what most kernels call
 
 
 @cache

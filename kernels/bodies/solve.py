@@ -12,7 +12,7 @@ from warp_abtree.kernels.bodies.constraints import Constraints, point_velocity
 from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT
 from warp_abtree.kernels.contacts.manifold import Manifolds
 
-wp.set_module_options(native.options())
+wp.set_module_options(native.options("base/lanes.cuh"))
 
 WARM_START = wp.constant(0)
 VELOCITY = wp.constant(1)

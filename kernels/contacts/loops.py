@@ -14,7 +14,7 @@ from warp_abtree.kernels.contacts.contact import Contacts, have_crossed, pair_di
 from warp_abtree.kernels.contacts.manifold import Curves
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
-wp.set_module_options(native.options())
+wp.set_module_options(native.options("base/lanes.cuh"))
 
 # Areas of a loop, relative to its length squared, that have no direction worth the name.
 LEAST_LOOP_AREA = wp.constant(wp.float64(2.0**-20))

@@ -18,7 +18,7 @@ from warp_abtree.kernels.contacts.manifold import NO_DEPTH, NO_POINT, Curves, Ro
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_corners
 from warp_abtree.kernels.triangle.segment import nearest_on_triangle
 
-wp.set_module_options(native.options())
+wp.set_module_options(native.options("base/counters.cuh", "base/lanes.cuh"))
 
 # A face's normal serves where the other face looks against it within 60 degrees.
 OPPOSED_LEAST = wp.constant(wp.float64(0.5))

@@ -20,7 +20,7 @@ from warp_abtree.kernels.contacts.candidates import (
 from warp_abtree.kernels.contacts.contact import Deferred
 from warp_abtree.kernels.contacts.manifold import NO_DEPTH, POINTS, Curves, Manifolds
 
-MODULE_OPTIONS = native.options("contacts/groups.cuh")
+MODULE_OPTIONS = native.options("base/lanes.cuh", "contacts/groups.cuh")
 wp.set_module_options(MODULE_OPTIONS)
 
 LARGE_PAIR = wp.constant(1024)

@@ -35,7 +35,7 @@ from warp_abtree.kernels.triangle.triangle_pair import (
     scale_triangles,
 )
 
-wp.set_module_options(native.options())
+wp.set_module_options(native.options("base/counters.cuh"))
 
 # Separations are no smaller in magnitude, so that their sign says which faces intersect, as float32 too.
 LEAST_SEPARATION = wp.constant(wp.float64(2.0**-126))

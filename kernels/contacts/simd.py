@@ -10,7 +10,7 @@ from warp_abtree.kernels.contacts.contact import Contacts, Deferred, contact_obj
 from warp_abtree.kernels.contacts.summary import PairContacts, mean_normal, write_no_contacts
 from warp_abtree.kernels.contacts.travel import choose_travel, reach_contacts
 
-wp.set_module_options(native.options("contacts/contact_sums.h", "contacts/contacts.h"))
+wp.set_module_options(native.options("base/lanes.cuh", "contacts/contact_sums.h", "contacts/contacts.h"))
 
 
 @native.func_native(cpu=True)

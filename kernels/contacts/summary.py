@@ -23,7 +23,7 @@ from warp_abtree.kernels.contacts.contact import (
 from warp_abtree.kernels.contacts.travel import choose_travel, loop_change, reach_contacts
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
-wp.set_module_options(native.options())
+wp.set_module_options(native.options("base/lanes.cuh"))
 
 
 @wp.struct

@@ -24,7 +24,9 @@ from warp_abtree.kernels.search.warp_stack import read_item, write_item
 from warp_abtree.kernels.triangle.corners import load_corners
 from warp_abtree.kernels.triangle.segment import intersect_faces
 
-MODULE_OPTIONS = native.options("exact/determinant.cuh", "exact/expansion.cuh", "search/nearest_stack.cuh")
+MODULE_OPTIONS = native.options(
+    "base/lanes.cuh", "exact/determinant.cuh", "exact/expansion.cuh", "search/nearest_stack.cuh"
+)
 wp.set_module_options(MODULE_OPTIONS)
 
 

@@ -68,7 +68,12 @@ from warp_abtree.kernels.triangle.distance_bounds import bound_faces, load_point
 from warp_abtree.kernels.triangle.triangle_pair import triangle_distance
 
 MODULE_OPTIONS = native.options(
-    "distance/bound_faces.cuh", "distance/warp_found.cuh", "search/load_balance.cuh", "search/nearest_stack.cuh"
+    "base/counters.cuh",
+    "base/lanes.cuh",
+    "distance/bound_faces.cuh",
+    "distance/warp_found.cuh",
+    "search/load_balance.cuh",
+    "search/nearest_stack.cuh",
 )
 wp.set_module_options(MODULE_OPTIONS)
 

@@ -30,7 +30,9 @@ from warp_abtree.kernels.search.mean_slabs import Slabs, count_uses, has_mean_sl
 from warp_abtree.kernels.triangle.corners import load_triangles
 from warp_abtree.kernels.triangle.triangle_pair import triangle_distance
 
-MODULE_OPTIONS = native.options("distance/lists.h", "distance/search.h", "search/load_balance.cuh", "search/slabs.cuh")
+MODULE_OPTIONS = native.options(
+    "base/lanes.cuh", "distance/lists.h", "distance/search.h", "search/load_balance.cuh", "search/slabs.cuh"
+)
 wp.set_module_options(MODULE_OPTIONS)
 
 NEAREST_WORDS = native.constant("NEAREST_WORDS")

@@ -45,7 +45,7 @@ from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM
 from warp_abtree.kernels.search.nearest_stack import nearest_stack, push_nearest, read_bound, write_bound
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item, write_item
 
-MODULE_OPTIONS = native.options("exact/determinant.cuh", "search/nearest_stack.cuh")
+MODULE_OPTIONS = native.options("base/lanes.cuh", "exact/determinant.cuh", "search/nearest_stack.cuh")
 wp.set_module_options(MODULE_OPTIONS)
 
 

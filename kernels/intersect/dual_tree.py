@@ -46,7 +46,12 @@ from warp_abtree.kernels.search.warp_stack import (
 )
 
 MODULE_OPTIONS = native.options(
-    "intersect/small_trees.cuh", "search/load_balance.cuh", "search/push_children.cuh", "search/warp_stack.cuh"
+    "base/counters.cuh",
+    "base/lanes.cuh",
+    "intersect/small_trees.cuh",
+    "search/load_balance.cuh",
+    "search/push_children.cuh",
+    "search/warp_stack.cuh",
 ) | {"block_dim": WARP_SIZE}
 wp.set_module_options(MODULE_OPTIONS)
 

@@ -123,7 +123,9 @@ def report_waiting(
 
 @wp.kernel(
     module="unique",
-    module_options=native.options("distance/bound_faces.cuh", "search/warp_stack.cuh"),
+    module_options=native.options(
+        "base/counters.cuh", "base/lanes.cuh", "distance/bound_faces.cuh", "search/warp_stack.cuh"
+    ),
     cuda_max_registers=128,
 )
 def find_near_kernel(

@@ -42,6 +42,8 @@ from warp_abtree.kernels.search.item import first_item, item_first, item_second
 from warp_abtree.kernels.search.load_balance import Work, take_thread, take_unit
 
 MODULE_OPTIONS = native.options(
+    "base/counters.cuh",
+    "base/lanes.cuh",
     "exact/determinant.cuh",
     "intersect/descend.h",
     "intersect/float32_filter.h",

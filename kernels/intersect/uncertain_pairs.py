@@ -24,7 +24,9 @@ from warp_abtree.kernels.triangle.float64_filter import (
 )
 
 RESOLVE_THREADS = RESOLVE_WARPS * WARP_SIZE  # of a block
-MODULE_OPTIONS = native.options("exact/determinant.cuh", "search/warp_stack.cuh") | {"block_dim": RESOLVE_THREADS}
+MODULE_OPTIONS = native.options(
+    "base/counters.cuh", "base/lanes.cuh", "exact/determinant.cuh", "search/warp_stack.cuh"
+) | {"block_dim": RESOLVE_THREADS}
 wp.set_module_options(MODULE_OPTIONS)
 
 

@@ -12,7 +12,7 @@ from warp_abtree.kernels.base.counters import add_lanes
 from warp_abtree.kernels.lod.ladder import LodPool
 from warp_abtree.kernels.lod.tolerance import loosening
 
-wp.set_module_options(native.options())
+wp.set_module_options(native.options("base/counters.cuh"))
 
 WORK_MOST = wp.constant(wp.float64(2.0**40))
 """Tests of one object, at most: sums of up to 2^22 objects are exact, so that they have no order."""

@@ -33,7 +33,9 @@ from warp_abtree.kernels.search.item import FACES, NODES, first_item, four_items
 from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item
 
-MODULE_OPTIONS = native.options("exact/apart_until.cuh", "exact/determinant.cuh", "search/motion_stack.cuh")
+MODULE_OPTIONS = native.options(
+    "base/counters.cuh", "base/lanes.cuh", "exact/apart_until.cuh", "exact/determinant.cuh", "search/motion_stack.cuh"
+)
 wp.set_module_options(MODULE_OPTIONS)
 
 GROUP = native.constant("MOTION_GROUP")

@@ -20,7 +20,7 @@ from warp_abtree.kernels.base.boxes import round_down, round_up
 from warp_abtree.kernels.base.lanes import block_sync
 from warp_abtree.kernels.base.nodes import Node, load_node, store_entry
 
-MODULE_OPTIONS = native.options("search/slabs.cuh")
+MODULE_OPTIONS = native.options("base/lanes.cuh", "search/slabs.cuh")
 wp.set_module_options(MODULE_OPTIONS)
 
 # Pairs that are searched without slabs of a state before these are made: it takes about as long as so many save.

@@ -16,7 +16,7 @@ from warp_abtree.kernels.update.refit import refit_inner, refit_leaf, unite_node
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
 
 BLOCK_THREADS = 1024  # of a block, where there are few states or deep trees
-MODULE_OPTIONS = native.options("update/block_marks.cuh")
+MODULE_OPTIONS = native.options("base/lanes.cuh", "update/block_marks.cuh")
 wp.set_module_options(MODULE_OPTIONS)
 
 BLOCK_DEPTH = native.constant("BLOCK_DEPTH")  # of the deepest tree that a block updates

@@ -10,7 +10,7 @@ from warp_abtree.kernels.base.nodes import Node, empty_node, load_node, store_no
 from warp_abtree.kernels.update.work_lists import UpdateLists
 
 TOP_THREADS = 512  # of the block that refits the levels next to the root
-MODULE_OPTIONS = native.options()
+MODULE_OPTIONS = native.options("base/lanes.cuh")
 wp.set_module_options(MODULE_OPTIONS)
 
 

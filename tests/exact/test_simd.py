@@ -24,7 +24,11 @@ pytestmark = pytest.mark.slow
 
 wp.set_module_options(
     native.options(
-        "exact/determinant.cuh", "intersect/descend.h", "intersect/float32_filter.h", "intersect/float64_filter.h"
+        "base/lanes.cuh",
+        "exact/determinant.cuh",
+        "intersect/descend.h",
+        "intersect/float32_filter.h",
+        "intersect/float64_filter.h",
     )
 )
 

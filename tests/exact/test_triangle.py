@@ -14,7 +14,7 @@ from warp_abtree.kernels.triangle.float64_filter import decide_triangles
 
 pytestmark = pytest.mark.slow
 
-wp.set_module_options(native.options("exact/determinant.cuh"))
+wp.set_module_options(native.options("base/lanes.cuh", "exact/determinant.cuh"))
 
 
 @wp.kernel

@@ -96,7 +96,7 @@ def test_a_capture_records_all_threads():
     np.testing.assert_array_equal(query.result().faces, expected)
 
 
-@wp.kernel(module="unique", module_options=native.options())
+@wp.kernel(module="unique", module_options=native.options("base/counters.cuh"))
 def count_item_kernel(count: int, taken: wp.array[int], seen: wp.array[int]):
     i = take_slots(taken, 1)
     while i < count:
