@@ -27,6 +27,13 @@ PUBLIC_MAX, FILE_LINES, FOLDER_FILES, FUNCTION_LINES, ARGUMENTS, NATIVE_LINES, S
     200,
     15,
 )
+NATIVE_FUNCTION_LINES = 80
+# A function of a header or a member of its structs, as clang-format lays them out: to the brace at its own indent.
+NATIVE_FUNCTION = re.compile(
+    r"^( {0,8})(?!struct |namespace |#|//|\})\S[^\n;{}]*\((?:[^;{}]|\{\})*?\)(?: const)?(?:\n? *: [^\n{]*)? \{\n"
+    r"(?:(?!\1\}).*\n)*\1\}",
+    re.M,
+)
 WARP_PRIVATE = {"_cls"}  # what tells a struct from other objects
 # Names of the old house and words made at home; the field's stand in their place (a word or a part of snake_case).
 BANNED = """asker carriers cover_piece crossing_faces dial hungry judge_budget judge_step left_open lodladder mailbox
@@ -267,6 +274,12 @@ def snippet_faults(tree):
             if len(code) > SNIPPET_LINES:
                 faults.append(f"line {node.lineno}: {len(code)} lines of native code")
     return faults
+
+
+def native_function_faults(text):
+    """List the native functions that are too long."""
+    found = [(match[0].count("\n") + 1, match[0].strip().partition("(")[0]) for match in NATIVE_FUNCTION.finditer(text)]
+    return [f"{name}: {lines} lines" for lines, name in found if lines > NATIVE_FUNCTION_LINES]
 
 
 def banned_faults(tree):

@@ -30,6 +30,7 @@ from layout_rules import (
     imports,
     kernel_faults,
     kernel_import_faults,
+    native_function_faults,
     outside_faults,
     package_of,
     parse,
@@ -140,6 +141,7 @@ def test_native_code_stands_in_its_folder():
     lengths = {shown(path): len(path.read_text(encoding="utf-8").splitlines()) for path in NATIVE}
     assert {name: count for name, count in lengths.items() if count > NATIVE_LINES} == {}
     assert [shown(path) for path in NATIVE if title_faults(path.read_text(encoding="utf-8"))] == []
+    assert [fault for path in NATIVE for fault in native_function_faults(path.read_text(encoding="utf-8"))] == []
 
 
 def test_kernel_folders_hold_no_code_in_init():
@@ -266,6 +268,12 @@ def test_rule_of_structs_and_words_catches(source):
 
 
 def test_rule_of_native_code_catches():
+    for begin, end in (
+        ("int f(int x) {", "}"),
+        ("struct A {\n    void f(int x) const {", "    }\n};"),
+    ):
+        assert native_function_faults(f"{begin}\n" + "        ++x;\n" * 79 + end)
+        assert not native_function_faults(f"{begin}\n" + "        ++x;\n" * 78 + end)
     assert snippet_faults(parse('CODE = """' + "int x = 0;\n" * 16 + '"""'))
     assert not snippet_faults(parse('CODE = """' + "int x = 0;\n" * 15 + '"""\n"""' + "Prose; more.\n" * 20 + '"""'))
 

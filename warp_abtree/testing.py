@@ -12,6 +12,7 @@ from warp_abtree.checks.regime import Regime, change_regime, current_regime, res
 from warp_abtree.kernels.exact.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.motion.face_pair import CLEAR, UNDECIDED, FirstContact
 from warp_abtree.kernels.motion.linear import advance_corners_kernel
+from warp_abtree.kernels.native import options as kernel_options
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, float32_filter_triangles
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
 from warp_abtree.state.lod_update import LodUpdate
@@ -30,6 +31,7 @@ __all__ = [
     "float32_filter_triangles",
     "force_refits",
     "full_refit_fraction",
+    "kernel_options",
     "read_bits",
     "regime",
     "repeat_update",

@@ -42,7 +42,7 @@ class ModelPool:
     centre: wp.array(dtype=wp.vec3d)  # of the box of its vertices [model units], shape [model]
 
 
-@wp.func_native(native.body("base/numbers.cuh", "load_vertex"))
+@native.func_native()
 def load_vertex(vertices: wp.array(dtype=wp.vec4d), i: wp.int32) -> wp.vec3d:
     """Return a position of `ModelPool.vertex_pos`, which nothing writes during a kernel."""
 
@@ -86,6 +86,6 @@ def pair_key(pair: wp.vec2i):
     return (wp.int64(pair[0]) << wp.int64(32)) | wp.int64(pair[1])
 
 
-@wp.func_native(native.body("base/numbers.cuh", "no_vector"))
+@native.func_native()
 def no_vector() -> wp.vec3d:
     """Return three NaNs of the bits 0x7ff8000000000000 on every device."""

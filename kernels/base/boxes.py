@@ -46,7 +46,7 @@ def round_up_vec(x: wp.vec3d):
     return wp.vec3(round_up(x[0]), round_up(x[1]), round_up(x[2]))
 
 
-@wp.func_native(native.body("base/numbers.cuh", "fuse32"))
+@native.func_native()
 def fuse32(a: wp.float32, b: wp.float32, c: wp.float32) -> wp.float32:
     """Return a b + c, rounded once on every device (fused multiply-add): half the work, and no less exact."""
 
@@ -88,7 +88,7 @@ def pose_box(lower: wp.vec3, upper: wp.vec3, rotation: wp.mat33, translation: wp
     return box
 
 
-@wp.func_native(native.body("base/numbers.cuh", "all_within"))
+@native.func_native()
 def all_within(p: wp.vec3, u: wp.vec3, q: wp.vec3, v: wp.vec3) -> bool:
     """Return whether |p| <= u and |q| <= v in every component, without branches."""
 

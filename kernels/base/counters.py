@@ -1,36 +1,32 @@
 """Counters and totals in memory, which the lanes of a warp add to by one atomic."""
 
-import functools
-
 import warp as wp
 
 from warp_abtree.kernels import native
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-counters_code = functools.partial(native.body, "base/counters.cuh")
 
-
-@wp.func_native(counters_code("add_lanes"))
+@native.func_native()
 def add_lanes(totals: wp.array(dtype=wp.int64), i: wp.int32, x: wp.int64):
     """Add the values of all lanes of a warp to a total; all lanes call it together, with the same i."""
 
 
-@wp.func_native(counters_code("reserve_slot"))
+@native.func_native()
 def reserve_slot(total: wp.array(dtype=wp.int32), flag: bool) -> wp.int32:
     """Count the set flags into total[0] with one atomic a warp; return the slot of each lane whose flag is set."""
 
 
-@wp.func_native(counters_code("take_slots"))
+@native.func_native()
 def take_slots(total: wp.array(dtype=wp.int32), count: wp.int32) -> wp.int32:
     """Count more into total[0] and return what it was; on the CPU, Warp's own atomics race with other threads."""
 
 
-@wp.func_native(counters_code("add_warp_sum"))
+@native.func_native()
 def add_warp_sum(totals: wp.array(dtype=wp.int64), i: wp.int32, x: wp.int32):
     """Add a value of every lane to totals[i] with one atomic a warp."""
 
 
-@wp.func_native(counters_code("count_flags"))
+@native.func_native()
 def count_flags(totals: wp.array(dtype=wp.int64), i: wp.int32, flag: bool):
     """Count the set flags into totals[i], i >= 0 of each lane, with one atomic for those that share it."""

@@ -5,7 +5,7 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import StatePool
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options())
 
 SPAN_MIN = wp.constant(wp.float32(2.0**-126))
 
@@ -26,15 +26,15 @@ class Node:
     face: wp.int32
 
 
-@wp.func_native(native.body("base/numbers.cuh", "load_constant"))
+@native.func_native()
 def load_constant(values: wp.array(dtype=wp.vec4), i: wp.int64) -> wp.vec4: ...
 
 
-@wp.func_native(native.body("base/numbers.cuh", "load_entry"))
+@native.func_native()
 def load_entry(values: wp.array(dtype=wp.vec4), i: wp.int64) -> wp.vec4: ...
 
 
-@wp.func_native(native.body("base/numbers.cuh", "store_entry"))
+@native.func_native()
 def store_entry(values: wp.array(dtype=wp.vec4), i: wp.int64, value: wp.vec4): ...
 
 

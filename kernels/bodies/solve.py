@@ -5,6 +5,7 @@ Pairs of one color share no dynamic body, so one thread for all of them and a th
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.lanes import block_sync
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, Bodies
@@ -12,7 +13,7 @@ from warp_abtree.kernels.bodies.constraints import Constraints, point_velocity
 from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT
 from warp_abtree.kernels.contacts.manifold import Manifolds
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("base/lanes.cuh"))
 
 WARM_START = wp.constant(0)
 VELOCITY = wp.constant(1)

@@ -10,7 +10,7 @@ from warp_abtree.kernels.build import heap as queue
 from warp_abtree.kernels.build import vertex_forest as forest
 from warp_abtree.kernels.build.quadric import Quadric, quadric_error, quadric_minimum, quadric_moved, quadric_plane
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(native.options("build/fetch_edges.h") | {"fuse_fp": True})
 
 RUNNING = wp.constant(0)
 FINISHED = wp.constant(1)
@@ -45,7 +45,7 @@ class Surface:
     stamp: wp.array(dtype=int)  # [node_capacity], last node that met this one as a neighbour
 
 
-@wp.func_native(native.body("build/fetch_edges.h", "fetch_edges"))
+@native.func_native(cpu=True)
 def fetch_edges(surface: Surface, rings: forest.Rings, heap: queue.Heap, size: wp.int32):
     """Prefetch what the next merges will read into the caches of this core."""
 

@@ -7,10 +7,11 @@ other faces and by those around the merge.
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.build import triangle_cover as cover
 from warp_abtree.kernels.build.vertex_forest import absorb_ring, count_dying, third_corner, third_vertices_live
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("build/cover_ring.h", "build/fetch_merge.h"))
 
 
 # Entries of `Replay.counter`, kept between launches.

@@ -51,7 +51,7 @@ def heap_before(key_a: wp.float64, pair_a: wp.int64, key_b: wp.float64, pair_b: 
     return key_a < key_b or (key_a == key_b and pair_a < pair_b)
 
 
-@wp.func_native(native.body("build/fetch_edges.h", "fetch_entries"))
+@native.func_native(cpu=True)
 def fetch_entries(heap: Heap, child: wp.int32):
     """Prefetch the children of four entries into the caches of this core."""
 

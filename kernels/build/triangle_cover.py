@@ -71,7 +71,7 @@ class Covers:
     limit: wp.array(dtype=wp.float64)  # [rows], squared running maximum after each triangle
 
 
-@wp.func_native(native.body("build/cover_ring.h", "cover_ring"))
+@native.func_native(cpu=True)
 def cover_ring(
     replay: Replay,
     covers: Covers,
@@ -92,7 +92,7 @@ def cover_ring(
     """
 
 
-@wp.func_native(native.body("build/fetch_merge.h", "fetch_merge"))
+@native.func_native(cpu=True)
 def fetch_merge(replay: Replay, merge_pair: wp.array2d(dtype=int), merge_count: wp.int32, j: wp.int32):
     """Prefetch what the merges after merge j will read into the caches of this core."""
 

@@ -1,7 +1,5 @@
 """The candidates of a pair's contacts, listed and searched by the threads of a block, on the CPU by one."""
 
-import functools
-
 import warp as wp
 
 from warp_abtree.kernels import native
@@ -11,32 +9,30 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 CANDIDATES = wp.constant(2)  # of each contact, numbered on from contact to contact
 
-group_code = functools.partial(native.body, "contacts/groups.cuh")
 
-
-@wp.func_native(group_code("group_size"))
+@native.func_native()
 def group_size() -> wp.int32: ...
 
 
-@wp.func_native(group_code("group_lane"))
+@native.func_native()
 def group_lane() -> wp.int32: ...
 
 
-@wp.func_native(group_code("group_sync"))
+@native.func_native()
 def group_sync(): ...
 
 
-@wp.func_native(group_code("must_measure"))
+@native.func_native()
 def must_measure(chosen: wp.int32) -> bool:
     """Return whether all candidates are measured against the points chosen: always on a GPU, without divergence."""
 
 
-@wp.func_native(group_code("greatest_of_group"))
+@native.func_native()
 def greatest_of_group(x: wp.float64, item: wp.int32) -> wp.vec2d:
     """Return the greatest number of all threads, and the item of a thread that has it, the least of several."""
 
 
-@wp.func_native(group_code("rank_in_group"))
+@native.func_native()
 def rank_in_group(flag: bool) -> wp.int32:
     """Return how many threads have set their flag, times 2^16, and how many before this one."""
 

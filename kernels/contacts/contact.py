@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees, load_vertex
 from warp_abtree.kernels.base.lanes import warp_lane, warp_size
 from warp_abtree.kernels.base.poses import PairBatch, pose_point
@@ -11,7 +12,7 @@ from warp_abtree.kernels.triangle.corners import load_corner_ids, load_corners
 from warp_abtree.kernels.triangle.segment import face_normal, intersect_faces, unit_vector
 from warp_abtree.kernels.triangle.segment_filter import filter_normal, filter_segment
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("base/lanes.cuh", "exact/determinant.cuh", "exact/expansion.cuh"))
 
 # Differences of unit normals, and means of them, that are shorter have no direction worth the name.
 SHORTEST_NORMAL = wp.constant(wp.float64(2.0**-20))

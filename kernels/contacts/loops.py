@@ -7,6 +7,7 @@ nearer than a gap, are of no loop.
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import LAST_KEY, Trees
 from warp_abtree.kernels.base.lanes import add_in_order, count_lanes, first_lane, six_numbers, warp_lane, warp_size
 from warp_abtree.kernels.base.poses import PairBatch
@@ -14,7 +15,7 @@ from warp_abtree.kernels.contacts.contact import Contacts, have_crossed, pair_di
 from warp_abtree.kernels.contacts.manifold import Curves
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("base/lanes.cuh"))
 
 # Areas of a loop, relative to its length squared, that have no direction worth the name.
 LEAST_LOOP_AREA = wp.constant(wp.float64(2.0**-20))

@@ -2,13 +2,14 @@
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import PairBatch, pose_point
 from warp_abtree.kernels.contacts.contact import Contacts, have_crossed
 from warp_abtree.kernels.triangle.corners import load_corners
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options())
 
 POINTS = wp.constant(8)
 """Points that stand for a pair, unless told otherwise."""

@@ -7,6 +7,7 @@ inside, or beyond a thin wall. In either case points count only where no other f
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, Trees, load_vertex
 from warp_abtree.kernels.base.counters import reserve_slot
 from warp_abtree.kernels.base.lanes import rank_flag, warp_any, warp_size
@@ -17,7 +18,7 @@ from warp_abtree.kernels.contacts.manifold import NO_DEPTH, NO_POINT, Curves, Ro
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_corners
 from warp_abtree.kernels.triangle.segment import nearest_on_triangle
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("base/counters.cuh", "base/lanes.cuh"))
 
 # A face's normal serves where the other face looks against it within 60 degrees.
 OPPOSED_LEAST = wp.constant(wp.float64(0.5))

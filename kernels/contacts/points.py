@@ -4,6 +4,7 @@ import functools
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.lanes import warp_any
 from warp_abtree.kernels.base.poses import PairBatch
@@ -20,7 +21,7 @@ from warp_abtree.kernels.contacts.candidates import (
 from warp_abtree.kernels.contacts.contact import Deferred
 from warp_abtree.kernels.contacts.manifold import NO_DEPTH, POINTS, Curves, Manifolds
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = native.options("base/lanes.cuh", "contacts/groups.cuh")
 wp.set_module_options(MODULE_OPTIONS)
 
 LARGE_PAIR = wp.constant(1024)

@@ -7,6 +7,7 @@ shortest motion that parts them, and the direction is a normal of either face or
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.counters import reserve_slot
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
@@ -34,7 +35,7 @@ from warp_abtree.kernels.triangle.triangle_pair import (
     scale_triangles,
 )
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("base/counters.cuh"))
 
 # Separations are no smaller in magnitude, so that their sign says which faces intersect, as float32 too.
 LEAST_SEPARATION = wp.constant(wp.float64(2.0**-126))

@@ -10,10 +10,10 @@ from warp_abtree.kernels.contacts.contact import Contacts, Deferred, contact_obj
 from warp_abtree.kernels.contacts.summary import PairContacts, mean_normal, write_no_contacts
 from warp_abtree.kernels.contacts.travel import choose_travel, reach_contacts
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("base/lanes.cuh", "contacts/contact_sums.h", "contacts/contacts.h"))
 
 
-@wp.func_native(native.body("contacts/contacts.h", "simd_contacts"))
+@native.func_native(cpu=True)
 def simd_contacts(
     models: ModelPool,
     states: StatePool,
@@ -37,17 +37,17 @@ def simd_contacts(
     """
 
 
-@wp.func_native(native.body("contacts/contact_sums.h", "simd_sum_lengths"))
+@native.func_native(cpu=True)
 def simd_sum_lengths(contacts: Contacts, ends: wp.vec2i) -> six_numbers:
     """Return the length of an object pair's contacts, and how many are of faces that intersect, as `sum_lengths`."""
 
 
-@wp.func_native(native.body("contacts/contact_sums.h", "simd_sum_means"))
+@native.func_native(cpu=True)
 def simd_sum_means(contacts: Contacts, ends: wp.vec2i, total: wp.float64, number: wp.float64) -> six_numbers:
     """Return the mean point of a pair's contacts, from the first end, and the mean of normals, as `sum_means`."""
 
 
-@wp.func_native(native.body("contacts/contact_sums.h", "simd_sum_areas"))
+@native.func_native(cpu=True)
 def simd_sum_areas(contacts: Contacts, ends: wp.vec2i, middle: wp.vec3d, normal: wp.vec3d) -> six_numbers:
     """Return the area within a pair's contact curve and its change, as `sum_chunks`."""
 

@@ -8,6 +8,7 @@ the other (`simd`).
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees, no_vector
 from warp_abtree.kernels.base.lanes import add_in_order, six_numbers, warp_any, warp_lane, warp_max, warp_size
 from warp_abtree.kernels.base.poses import PairBatch
@@ -22,7 +23,7 @@ from warp_abtree.kernels.contacts.contact import (
 from warp_abtree.kernels.contacts.travel import choose_travel, loop_change, reach_contacts
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("base/lanes.cuh"))
 
 
 @wp.struct

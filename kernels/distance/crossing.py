@@ -24,11 +24,13 @@ from warp_abtree.kernels.search.warp_stack import read_item, write_item
 from warp_abtree.kernels.triangle.corners import load_corners
 from warp_abtree.kernels.triangle.segment import intersect_faces
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = native.options(
+    "base/lanes.cuh", "exact/determinant.cuh", "exact/expansion.cuh", "search/nearest_stack.cuh"
+)
 wp.set_module_options(MODULE_OPTIONS)
 
 
-@wp.func_native(native.body("search/nearest_stack.cuh", "push_in_order"))
+@native.func_native()
 def push_in_order(items: wp.uint64, end: wp.int32, kinds: wp.vec4i, children: four_items) -> wp.int32:
     """Push the items that are not dropped, the first child of the first lane last; return the new end."""
 

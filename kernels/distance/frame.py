@@ -22,6 +22,7 @@ D is small: `stretch` and `slack_of`.
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.boxes import ROUNDING_DOWN, ROUNDING_UP
 from warp_abtree.kernels.base.generation import STALE
@@ -50,7 +51,7 @@ from warp_abtree.kernels.triangle.distance import (
 )
 from warp_abtree.kernels.triangle.triangle_pair import PAIR_ROUNDING, triangle_distance
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options())
 
 # Sorts behind all face pairs.
 NO_FACES = wp.constant(wp.int64(2**63 - 1))

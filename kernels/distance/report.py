@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, Trees, load_vertex, no_vector
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.poses import PairBatch, pose_point
@@ -12,7 +13,7 @@ from warp_abtree.kernels.triangle.corners import load_triangles
 from warp_abtree.kernels.triangle.distance import DISTANCE_MAX
 from warp_abtree.kernels.triangle.triangle_pair import feature_weights, nearest_features
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options())
 
 # Of surfaces that do not intersect though their distance rounds to 0.
 LEAST_DISTANCE = wp.constant(wp.float64(2.0**-1022))

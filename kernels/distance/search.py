@@ -7,6 +7,7 @@ lowest pair, are found whatever the order. With a tolerance other faces are foun
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.boxes import ROUNDING_DOWN
 from warp_abtree.kernels.base.counters import add_warp_sum
@@ -66,7 +67,14 @@ from warp_abtree.kernels.triangle.corners import load_triangles
 from warp_abtree.kernels.triangle.distance_bounds import bound_faces, load_points
 from warp_abtree.kernels.triangle.triangle_pair import triangle_distance
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = native.options(
+    "base/counters.cuh",
+    "base/lanes.cuh",
+    "distance/bound_faces.cuh",
+    "distance/warp_found.cuh",
+    "search/load_balance.cuh",
+    "search/nearest_stack.cuh",
+)
 wp.set_module_options(MODULE_OPTIONS)
 
 # Fewer items than the traversal gives away: far more lies below one.

@@ -30,13 +30,15 @@ from warp_abtree.kernels.search.mean_slabs import Slabs, count_uses, has_mean_sl
 from warp_abtree.kernels.triangle.corners import load_triangles
 from warp_abtree.kernels.triangle.triangle_pair import triangle_distance
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = native.options(
+    "base/lanes.cuh", "distance/lists.h", "distance/search.h", "search/load_balance.cuh", "search/slabs.cuh"
+)
 wp.set_module_options(MODULE_OPTIONS)
 
 NEAREST_WORDS = native.constant("NEAREST_WORDS")
 
 
-@wp.func_native(native.body("distance/lists.h", "open_search"))
+@native.func_native(cpu=True)
 def open_search(
     upper: wp.float32,
     found: bool,
@@ -55,7 +57,7 @@ def open_search(
     """
 
 
-@wp.func_native(native.body("distance/search.h", "search_nearest"))
+@native.func_native(cpu=True)
 def search_nearest(
     models: ModelPool,
     states: StatePool,
@@ -73,7 +75,7 @@ def search_nearest(
     """
 
 
-@wp.func_native(native.body("distance/lists.h", "take_nearest"))
+@native.func_native(cpu=True)
 def take_nearest(upper: wp.float32, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)) -> wp.int64:
     """Return the faces that wait and seem nearest, -1 if none may be the nearest.
 

@@ -11,7 +11,7 @@ from warp_abtree.kernels import native
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
-@wp.func_native(native.body("exact/determinant.h", "exact_volume"))
+@native.func_native()
 def exact_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.float64:
     """Return det(a - d, b - d, c - d), rounded once."""
 

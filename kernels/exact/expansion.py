@@ -37,11 +37,11 @@ def two_product(a: wp.float64, b: wp.float64):
     return x, fuse_multiply(a, b, -x)
 
 
-@wp.func_native(native.body("exact/expansion.h", "sum_volume"))
+@native.func_native()
 def sum_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.float64: ...
 
 
-@wp.func_native(native.body("exact/expansion.h", "sum_area"))
+@native.func_native()
 def sum_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d) -> wp.float64: ...
 
 

@@ -11,11 +11,11 @@ from warp_abtree.kernels import native
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
-@wp.func_native(native.body("exact/int128.h", "integer_orient3d"))
+@native.func_native()
 def integer_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, bound: wp.float64) -> wp.int32:
     """Return the sign of det(a - d, b - d, c - d), within 4 times a bound, or UNCERTAIN where 128 bits are too few."""
 
 
-@wp.func_native(native.body("exact/int128.h", "integer_orient2d"))
+@native.func_native()
 def integer_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, bound: wp.float64) -> wp.int32:
     """Return the sign of det(a - c, b - c), within 4 times a bound, or UNCERTAIN where 128 bits are too few."""

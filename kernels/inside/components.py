@@ -6,12 +6,13 @@ mesh: a neck that is thinned to an edge without faces leaves two.
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.lanes import warp_lane, warp_size, warp_sync
 from warp_abtree.kernels.contacts.loops import find_root, unite_roots
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("base/lanes.cuh"))
 
 NO_FACE = wp.constant(2**31 - 1)
 
@@ -30,7 +31,7 @@ class Solids:
     first: wp.array(dtype=wp.int32)  # where its places begin, -1 where there is no state, shape [state]
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False, "fuse_fp": False})
+@wp.kernel(module="unique", module_options=native.options("base/lanes.cuh"))
 def find_component_kernel(
     models: ModelPool,
     states: StatePool,

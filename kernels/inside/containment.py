@@ -6,6 +6,7 @@ component decides.
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees, load_vertex
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
@@ -14,7 +15,7 @@ from warp_abtree.kernels.inside.components import NO_FACE, Solids
 from warp_abtree.kernels.inside.parity import is_inside
 from warp_abtree.kernels.intersect.face_pairs import Hits
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("exact/determinant.cuh"))
 
 # Of `Hits.any_hit` beside 1 for surfaces that meet: a component of A in B, and of B in A.
 FIRST_INSIDE, SECOND_INSIDE = wp.constant(2), wp.constant(3)
@@ -43,7 +44,7 @@ def find_inside(trees: Trees, pose: PairPose, solids: Solids, state: wp.int32, o
     return lowest
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False, "fuse_fp": False})
+@wp.kernel(module="unique", module_options=native.options("exact/determinant.cuh"))
 def find_contained_kernel(
     trees: Trees,
     batch: PairBatch,

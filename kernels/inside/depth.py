@@ -8,6 +8,7 @@ so that the deepest sample, the lowest of several, is found in any order.
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.boxes import round_up
 from warp_abtree.kernels.base.generation import STALE
@@ -44,7 +45,7 @@ from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM
 from warp_abtree.kernels.search.nearest_stack import nearest_stack, push_nearest, read_bound, write_bound
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item, write_item
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = native.options("base/lanes.cuh", "exact/determinant.cuh", "search/nearest_stack.cuh")
 wp.set_module_options(MODULE_OPTIONS)
 
 

@@ -2,13 +2,14 @@
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import LAST_KEY, ObjectPool, Trees, pair_key
 from warp_abtree.kernels.base.boxes import round_down, round_up
 from warp_abtree.kernels.base.generation import LaunchRecord, is_stale
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import ROUNDING_64, measure_skew
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options())
 
 # Of sums of lengths in float64.
 REACH_ROUNDING = wp.constant(wp.float64(1.0 + 2.0**-48))

@@ -40,7 +40,7 @@ WAITING_LENGTH = int(FACES_READY) + 4 * ITEMS_AT_ONCE + 16  # 16 are written at 
 three_numbers = wp.types.vector(length=3, dtype=wp.int64)
 
 
-@wp.func_native(native.body("intersect/descend.h", "descend"))
+@native.func_native(cpu=True)
 def descend(
     states: StatePool,
     pose: PairPose,
@@ -59,7 +59,7 @@ def descend(
     """
 
 
-@wp.func_native(native.body("intersect/descend.h", "move_below"))
+@native.func_native(cpu=True)
 def move_below(
     floors: wp.vec2i, top: wp.int32, stack: wp.array(dtype=wp.int64), below: wp.array(dtype=wp.int64)
 ) -> wp.vec2i:
@@ -69,12 +69,12 @@ def move_below(
     """
 
 
-@wp.func_native(native.body("intersect/open_subtrees.h", "slab_cost"))
+@native.func_native(cpu=True)
 def slab_cost(models: ModelPool, states: StatePool, pose: PairPose, repeats: wp.int32) -> wp.int64:
     """Estimate the cost of an object pair's slabs in node pair tests, for an A of one pair before it or two."""
 
 
-@wp.func_native(native.body("intersect/open_subtrees.h", "open_subtrees"))
+@native.func_native(cpu=True)
 def open_subtrees(
     models: ModelPool,
     states: StatePool,
@@ -88,7 +88,7 @@ def open_subtrees(
     """
 
 
-@wp.func_native(native.body("intersect/subtrees.h", "descend_subtrees"))
+@native.func_native(cpu=True)
 def descend_subtrees(
     models: ModelPool,
     states: StatePool,

@@ -8,6 +8,7 @@ import functools
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.counters import add_warp_sum
 from warp_abtree.kernels.base.lanes import WARP_SIZE, hold_uniform, warp_any, warp_lane, warp_size, warp_sync
@@ -44,7 +45,14 @@ from warp_abtree.kernels.search.warp_stack import (
     warp_stack,
 )
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False, "block_dim": WARP_SIZE}
+MODULE_OPTIONS = native.options(
+    "base/counters.cuh",
+    "base/lanes.cuh",
+    "intersect/small_trees.cuh",
+    "search/load_balance.cuh",
+    "search/push_children.cuh",
+    "search/warp_stack.cuh",
+) | {"block_dim": WARP_SIZE}
 wp.set_module_options(MODULE_OPTIONS)
 
 

@@ -25,7 +25,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 ERROR_MAX, NEAR_GAP_MAX = wp.constant(wp.float32(2.0**20)), wp.constant(wp.float32(2.0**40))
 
 
-@wp.func_native(native.body("intersect/near_filter.h", "simd_near_filter"))
+@native.func_native(cpu=True)
 def simd_near_filter(
     models: ModelPool, states: StatePool, pose: PairPose, waiting: wp.int32, faces: wp.array(dtype=wp.int64)
 ) -> wp.int32:
@@ -108,7 +108,13 @@ def report_waiting(
         report_hit(slot, p | NEAR_BIT, pair_poses[p].swapped, item[1], item[2], hits)
 
 
-@wp.kernel(module="unique", module_options={"enable_backward": False, "fuse_fp": False}, cuda_max_registers=128)
+@wp.kernel(
+    module="unique",
+    module_options=native.options(
+        "base/counters.cuh", "base/lanes.cuh", "distance/bound_faces.cuh", "search/warp_stack.cuh"
+    ),
+    cuda_max_registers=128,
+)
 def find_near_kernel(threads: wp.int32, trees: Trees, batch: PairBatch, hits_inout: Hits):
     """Report the face pairs that are apart and nearer than the gap, in a grid-stride loop; a block is a warp.
 

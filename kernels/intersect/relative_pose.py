@@ -4,6 +4,7 @@ import functools
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.generation import record_launch
 from warp_abtree.kernels.base.lanes import WARP_SIZE
@@ -13,7 +14,7 @@ from warp_abtree.kernels.intersect.small_trees import is_small
 from warp_abtree.kernels.search.load_balance import NO_UNIT, Work, note_descent, units_per_pair
 from warp_abtree.kernels.triangle.distance import DISTANCE_MAX, pad_distance
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False, "block_dim": WARP_SIZE}
+MODULE_OPTIONS = native.options() | {"block_dim": WARP_SIZE}
 wp.set_module_options(MODULE_OPTIONS)
 
 

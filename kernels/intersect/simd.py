@@ -41,13 +41,24 @@ from warp_abtree.kernels.intersect.relative_pose import ThreadSteps, pairs_start
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
 from warp_abtree.kernels.search.load_balance import Work, take_thread, take_unit
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = native.options(
+    "base/counters.cuh",
+    "base/lanes.cuh",
+    "exact/determinant.cuh",
+    "intersect/descend.h",
+    "intersect/float32_filter.h",
+    "intersect/float64_filter.h",
+    "intersect/near_filter.h",
+    "intersect/open_subtrees.h",
+    "intersect/subtrees.h",
+    "search/load_balance.cuh",
+)
 wp.set_module_options(MODULE_OPTIONS)
 
 long_counts = wp.types.vector(length=4, dtype=wp.int64)
 
 
-@wp.func_native(native.body("intersect/float32_filter.h", "simd_float32_filter"))
+@native.func_native(cpu=True)
 def simd_float32_filter(
     models: ModelPool,
     states: StatePool,
@@ -72,7 +83,7 @@ def simd_float32_filter(
     """
 
 
-@wp.func_native(native.body("intersect/float64_filter.h", "simd_float64_filter"))
+@native.func_native(cpu=True)
 def simd_float64_filter(
     models: ModelPool,
     states: StatePool,

@@ -42,45 +42,45 @@ TILE_PAIRS, TILE_HITS = native.constant("TILE_PAIRS"), native.constant("TILE_HIT
 SMALL_A, SMALL_B = native.constant("SMALL_A"), native.constant("SMALL_B")
 
 
-@wp.func_native(native.body("intersect/small_trees.cuh", "read_number"))
+@native.func_native()
 def read_number(items: wp.uint64, i: wp.int32) -> wp.int32: ...
 
 
-@wp.func_native(native.body("intersect/small_trees.cuh", "write_number"))
+@native.func_native()
 def write_number(items: wp.uint64, i: wp.int32, flag: bool, x: wp.int32): ...
 
 
-@wp.func_native(native.body("intersect/small_trees.cuh", "read_half"))
+@native.func_native()
 def read_half(items: wp.uint64, i: wp.int32) -> wp.int32: ...
 
 
-@wp.func_native(native.body("intersect/small_trees.cuh", "push_half"))
+@native.func_native()
 def push_half(items: wp.uint64, end: wp.int32, flag: bool, x: wp.int32):
     """Append the half words whose flag is set to a list that ends there."""
 
 
-@wp.func_native(native.body("intersect/small_trees.cuh", "spans_overlap"))
+@native.func_native()
 def spans_overlap(a: wp.vec3, b: wp.vec3, c: wp.vec3, d: wp.vec3) -> bool:
     """Return whether the boxes from a to b and from c to d overlap, without branches."""
 
 
-@wp.func_native(native.body("intersect/small_trees.cuh", "compare_boxes"))
+@native.func_native()
 def compare_boxes(
     items: wp.uint64, rows: wp.int32, lower: wp.vec3, upper: wp.vec3, posed_lower: wp.vec3, posed_upper: wp.vec3
 ) -> wp.uint32:
     """Return a bit for each of the first leaves of A in place whose boxes overlap those of a leaf of B."""
 
 
-@wp.func_native(native.body("intersect/small_trees.cuh", "reserve_run"))
+@native.func_native()
 def reserve_run(total: wp.array(dtype=wp.int32), count: wp.int32) -> wp.int32:
     """Add the same number of all lanes to total[0]; return its value before."""
 
 
-@wp.func_native(native.body("intersect/small_trees.cuh", "read_quarter"))
+@native.func_native()
 def read_quarter(items: wp.uint64, i: wp.int32) -> wp.vec4: ...
 
 
-@wp.func_native(native.body("intersect/small_trees.cuh", "write_quarter"))
+@native.func_native()
 def write_quarter(items: wp.uint64, i: wp.int32, flag: bool, x: wp.vec4): ...
 
 

@@ -6,6 +6,7 @@ the same few object pairs, and a warp counts for them together.
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees, load_vertex
 from warp_abtree.kernels.base.counters import count_flags, reserve_slot
 from warp_abtree.kernels.base.lanes import RESOLVE_WARPS, WARP_SIZE, resolve_lane, warp_size, warp_sync
@@ -23,7 +24,9 @@ from warp_abtree.kernels.triangle.float64_filter import (
 )
 
 RESOLVE_THREADS = RESOLVE_WARPS * WARP_SIZE  # of a block
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False, "block_dim": RESOLVE_THREADS}
+MODULE_OPTIONS = native.options(
+    "base/counters.cuh", "base/lanes.cuh", "exact/determinant.cuh", "search/warp_stack.cuh"
+) | {"block_dim": RESOLVE_THREADS}
 wp.set_module_options(MODULE_OPTIONS)
 
 

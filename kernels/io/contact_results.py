@@ -15,19 +15,19 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.contacts.contact import Contacts
 from warp_abtree.kernels.contacts.summary import PairContacts
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = native.options()
 wp.set_module_options(MODULE_OPTIONS)
 
 # Numbers of a record: three indices, five vectors, a flag, one more with a gap; a count, two vectors, a travel.
 CONTACT_NUMBERS, PAIR_NUMBERS = 19, 8
 
 
-@wp.func_native(native.body("base/numbers.cuh", "store_bits"))
+@native.func_native()
 def store_bits(bytes: wp.array(dtype=wp.uint8), at: wp.int32, size: wp.int32, bits: wp.int64):
     """Write the lowest bytes of a word, the lowest first."""
 
 
-@wp.func_native(native.body("base/numbers.cuh", "round_to_float32"))
+@native.func_native()
 def round_to_float32(x: wp.float64) -> wp.float32:
     """Return a number as float32, infinite beyond its range, NaN of the bits 0x7fc00000."""
 

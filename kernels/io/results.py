@@ -15,14 +15,14 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options())
 
 HEADER_WORDS = wp.constant(5)
 COUNT_COLUMNS = wp.constant(5)
 BLOCK_DIM = 256
 
 
-@wp.func_native(native.body("base/numbers.cuh", "store_flag"))
+@native.func_native()
 def store_flag(words: wp.array(dtype=wp.int64), at: wp.int64, flag: wp.int32):
     """Write a byte of 0 or 1 at a place counted in bytes."""
 

@@ -9,7 +9,7 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("io/sort_by_pair.h"))
 
 
 @wp.func
@@ -82,7 +82,7 @@ def place_row_kernel(
         start_out[i] = wp.lower_bound(key, 0, capacity + 1, wp.int64(i) << wp.int64(shift))
 
 
-@wp.func_native(native.body("io/sort_by_pair.h", "sort_by_pair"))
+@native.func_native(cpu=True)
 def sort_by_pair(
     count: wp.int32,
     pair_mask: wp.int32,

@@ -15,7 +15,7 @@ from warp_abtree.kernels.contacts.chunks import chunk_span, first_chunk
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK
 from warp_abtree.kernels.io.sort_hits import count_rows
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("io/segments.cuh"))
 
 # Threads of a block of each kernel here; on the CPU a block is one thread.
 SEGMENT_THREADS = native.constant("SEGMENT_THREADS")
@@ -23,7 +23,7 @@ SEGMENT_THREADS = native.constant("SEGMENT_THREADS")
 SEGMENT_KEYS = native.constant("SEGMENT_KEYS")
 
 
-@wp.func_native(native.body("io/segments.h", "start_segments"))
+@native.func_native()
 def start_segments(
     tile: wp.int32,
     rows: wp.int32,
@@ -35,11 +35,11 @@ def start_segments(
     """Write to start[p + 1] where the hits of pair p start, of as many pairs as a block has threads."""
 
 
-@wp.func_native(native.body("io/segments.h", "take_place"))
+@native.func_native()
 def take_place(end: wp.array(dtype=wp.int32), pair: wp.int32) -> wp.int32: ...
 
 
-@wp.func_native(native.body("io/segments.h", "sort_segment"))
+@native.func_native()
 def sort_segment(
     thread: wp.int32,
     threads: wp.int32,

@@ -2,11 +2,12 @@
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.counters import add_lanes
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("base/counters.cuh"))
 
 FRAMES, LAUNCHED, PAIRS, HITS, UNCERTAIN_PAIRS, APART, INTERSECTING, NODE_TESTS, TRIANGLE_TESTS = range(9)
 REFITTED, CHANGED, TURNED = 9, 10, 11

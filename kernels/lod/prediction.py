@@ -7,11 +7,12 @@ every object at its level whatever the view. Sums are of whole numbers, so that 
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.counters import add_lanes
 from warp_abtree.kernels.lod.ladder import LodPool
 from warp_abtree.kernels.lod.tolerance import loosening
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("base/counters.cuh"))
 
 WORK_MOST = wp.constant(wp.float64(2.0**40))
 """Tests of one object, at most: sums of up to 2^22 objects are exact, so that they have no order."""

@@ -4,7 +4,7 @@ As `search`, whose answers it has. A face pair is advanced by normals first, whi
 step by step, each with 31 others, since a step takes as long as its slowest lane, and the others are ten times as long.
 """
 
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import warp as wp
@@ -33,7 +33,9 @@ from warp_abtree.kernels.search.item import FACES, NODES, first_item, four_items
 from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = native.options(
+    "base/counters.cuh", "base/lanes.cuh", "exact/apart_until.cuh", "exact/determinant.cuh", "search/motion_stack.cuh"
+)
 wp.set_module_options(MODULE_OPTIONS)
 
 GROUP = native.constant("MOTION_GROUP")
@@ -42,38 +44,36 @@ GROUPED_LEAST = wp.constant(8192)
 MOTION_STACK_LENGTH = native.constant("MOTION_STACK_LENGTH")
 GOING_START, TIMES_START = native.constant("MOTION_GOING_START"), native.constant("MOTION_TIMES_START")
 
-motion_stack_code = partial(native.body, "search/motion_stack.cuh")
 
-
-@wp.func_native(motion_stack_code("motion_stack"))
+@native.func_native()
 def motion_stack() -> wp.uint64:
     """Return the address of this warp's lists, in shared memory on CUDA."""
 
 
-@wp.func_native(motion_stack_code("read_tag"))
+@native.func_native()
 def read_tag(items: wp.uint64, i: wp.int32) -> wp.float32:
     """Return the time until which the i-th pair is apart, or the number of steps of a face pair in progress."""
 
 
-@wp.func_native(motion_stack_code("read_slot"))
+@native.func_native()
 def read_slot(items: wp.uint64, i: wp.int32) -> wp.int32: ...
 
 
-@wp.func_native(motion_stack_code("write_entry"))
+@native.func_native()
 def write_entry(items: wp.uint64, i: wp.int32, item: wp.int64, tag: wp.float32, slot: wp.int32): ...
 
 
-@wp.func_native(motion_stack_code("write_time"))
+@native.func_native()
 def write_time(items: wp.uint64, i: wp.int32, time: wp.float64):
     """Write the time of the i-th face pair that goes on."""
 
 
-@wp.func_native(motion_stack_code("place_in"))
+@native.func_native()
 def place_in(end: wp.int32, flag: bool) -> wp.int32:
     """Return the place of this lane's entry in a list that ends there, of the lanes whose flag is set."""
 
 
-@wp.func_native(motion_stack_code("end_after"))
+@native.func_native()
 def end_after(end: wp.int32, flag: bool) -> wp.int32:
     """Return the end of such a list after that."""
 

@@ -9,6 +9,7 @@ grows at a rate s stays open until g + s h = 0; of faces it is taken for each of
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, StatePool, Trees
 from warp_abtree.kernels.base.boxes import pose_box
 from warp_abtree.kernels.base.nodes import Node, load_constant_node, load_node
@@ -34,7 +35,7 @@ from warp_abtree.kernels.search.item import INDEX_MASK, four_items, item_first, 
 from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, POSE_ROUNDING, corners_type, largest_coordinate
 from warp_abtree.kernels.triangle.float64_filter import float64_filter_triangles
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("exact/apart_until.cuh", "exact/determinant.cuh"))
 
 # 9 u^2 and some, that posed corners err by of the magnitudes that they are sums of.
 POSED_WORDS = wp.constant(wp.float64(2.0**-102))

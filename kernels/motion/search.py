@@ -24,14 +24,16 @@ from warp_abtree.kernels.search.load_balance import take_thread, take_unit
 from warp_abtree.kernels.search.nearest_stack import push_nearest, read_bound, write_bound
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, STRADDLING_START, read_item, write_item
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = native.options(
+    "exact/apart_until.cuh", "exact/determinant.cuh", "search/load_balance.cuh", "search/nearest_stack.cuh"
+)
 wp.set_module_options(MODULE_OPTIONS)
 
 # Words of 8 bytes of the lists of a thread of the CPU.
 LIST_WORDS = int(STRADDLING_START) + int(STRADDLING_START) // 2
 
 
-@wp.func_native(native.body("search/nearest_stack.cuh", "thread_lists"))
+@native.func_native()
 def thread_lists(memory: wp.array2d(dtype=wp.int64), thread: wp.int32) -> wp.uint64:
     """Return the address of a CPU thread's lists."""
 

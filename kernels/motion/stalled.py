@@ -29,7 +29,7 @@ row_type = wp.types.vector(length=6, dtype=wp.float64)
 BEYOND = wp.constant(wp.float64(2.0**-50))
 
 
-@wp.func_native(native.body("exact/apart_until.h", "apart_until"))
+@native.func_native()
 def apart_until(
     starts: words_type, ends: words_type, away: wp.vec3d, error: wp.float64, start: wp.float64, limit: wp.float64
 ) -> wp.vec2d:

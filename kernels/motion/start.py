@@ -10,6 +10,7 @@ from typing import Any
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, StatePool, Trees
 from warp_abtree.kernels.base.boxes import round_down, round_up
 from warp_abtree.kernels.base.generation import STALE, LaunchRecord, is_stale
@@ -22,7 +23,7 @@ from warp_abtree.kernels.motion.path import Paths, make_path
 from warp_abtree.kernels.motion.turn import turn_matrix
 from warp_abtree.kernels.search.item import DROPPED, first_item
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = native.options()
 wp.set_module_options(MODULE_OPTIONS)
 
 # Beside the ends of face pairs: to be searched from `time` on; of an object without a shortest turn.

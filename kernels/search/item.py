@@ -44,7 +44,7 @@ def item_first(item: wp.int64) -> wp.int32: ...
 def item_second(item: wp.int64) -> wp.int32: ...
 
 
-@wp.func_native(native.body("base/numbers.cuh", "children_of"))
+@native.func_native()
 def children_of(node: wp.int32) -> wp.int32:
     """Return the half of an item that names both children of a node."""
 

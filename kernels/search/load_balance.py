@@ -18,8 +18,6 @@ The word of `load_tickets`, from two counters side by side:
     [ tickets taken | served    ]
 """
 
-import functools
-
 import warp as wp
 
 from warp_abtree.kernels import native
@@ -62,40 +60,37 @@ class Work:
     record: LaunchRecord  # what the launch was given; here, since another argument takes time in every launch
 
 
-balance_code = functools.partial(native.body, "search/load_balance.cuh")
-
-
-@wp.func_native(balance_code("first_ended"))
+@native.func_native()
 def first_ended(descends: bool, counter: wp.array(dtype=wp.int32)) -> wp.int32:
     """Return the initial count of units and donations ended: 0, or a very negative one where nothing is given away."""
 
 
-@wp.func_native(balance_code("first_unit"))
+@native.func_native()
 def first_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
     """Return the unit that this warp starts with, NO_UNIT or more where there is no work."""
 
 
-@wp.func_native(balance_code("take_unit"))
+@native.func_native()
 def take_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
     """Return the number of a unit of work that no other warp has; from the number of units on there is none."""
 
 
-@wp.func_native(balance_code("claim_unit"))
+@native.func_native()
 def claim_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
     """Take a unit as `take_unit`, in the first lane alone, without waiting for the atomic."""
 
 
-@wp.func_native(balance_code("load_tickets"))
+@native.func_native()
 def load_tickets(counter: wp.array(dtype=wp.int32)) -> wp.int64:
     """Return the tickets taken and, in the low half, those served, to be subtracted when they have arrived."""
 
 
-@wp.func_native(balance_code("count_idle"))
+@native.func_native()
 def count_idle(tickets: wp.int64) -> wp.int32:
     """Return about how many warps wait for a donation."""
 
 
-@wp.func_native(balance_code("await_donation"))
+@native.func_native()
 def await_donation(counter: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32), ended: wp.int32) -> wp.int32:
     """End so many units and donations, and wait for a donation; return its slot, or -1 when all work is done.
 
@@ -103,16 +98,16 @@ def await_donation(counter: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.in
     """
 
 
-@wp.func_native(balance_code("free_slot"))
+@native.func_native()
 def free_slot(flag: wp.array(dtype=wp.int32), slot: wp.int32): ...
 
 
-@wp.func_native(balance_code("claim_slot"))
+@native.func_native()
 def claim_slot(counter: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32)) -> wp.int32:
     """Return the next ticket to serve, its slot free."""
 
 
-@wp.func_native(balance_code("fill_slot"))
+@native.func_native()
 def fill_slot(flag: wp.array(dtype=wp.int32), ticket: wp.int32):
     """Publish the items that this warp has put into the slot of a ticket."""
 
@@ -252,6 +247,6 @@ def donate_items(
     return head
 
 
-@wp.func_native(native.body("intersect/subtrees.h", "take_thread"))
+@native.func_native()
 def take_thread(counter: wp.array(dtype=wp.int32)) -> wp.int32:
     """Return the number of a thread that no other thread of a launch has."""

@@ -2,12 +2,13 @@
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, load_vertex
 from warp_abtree.kernels.base.boxes import round_up
 from warp_abtree.kernels.base.poses import SLAB_GAIN_UNIT
 from warp_abtree.kernels.search.slab_overlap import DIRECTION_LENGTH
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options())
 
 
 @wp.struct

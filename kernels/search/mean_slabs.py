@@ -20,7 +20,7 @@ from warp_abtree.kernels.base.boxes import round_down, round_up
 from warp_abtree.kernels.base.lanes import block_sync
 from warp_abtree.kernels.base.nodes import Node, load_node, store_entry
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = native.options("base/lanes.cuh", "search/slabs.cuh")
 wp.set_module_options(MODULE_OPTIONS)
 
 # Pairs that are searched without slabs of a state before these are made: it takes about as long as so many save.
@@ -53,12 +53,12 @@ class MeanSlab:
     radius: wp.float32  # of a ball about the middle of the node's box that holds the faces
 
 
-@wp.func_native(native.body("search/slabs.cuh", "is_last_block"))
+@native.func_native()
 def is_last_block(ended: wp.array(dtype=wp.int32), i: wp.int32, amount: wp.int32, whole: wp.int32) -> bool:
     """Add to the work ended; return whether this block is the last, which then sees what the others have written."""
 
 
-@wp.func_native(native.body("search/slabs.cuh", "load_written"))
+@native.func_native()
 def load_written(values: wp.array(dtype=wp.vec4), i: wp.int64) -> wp.vec4:
     """Return an entry that another block may have written."""
 

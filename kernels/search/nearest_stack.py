@@ -1,7 +1,5 @@
 """A warp's lists of node pairs and face pairs in shared memory, with a bound for each entry."""
 
-import functools
-
 import warp as wp
 
 from warp_abtree.kernels import native
@@ -9,12 +7,11 @@ from warp_abtree.kernels.search.item import four_items
 
 OPEN_START = native.constant("NEAREST_OPEN_START")
 OPEN_LENGTH = native.constant("NEAREST_OPEN_LENGTH")
-nearest_stack_code = functools.partial(native.body, "search/nearest_stack.cuh")
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
-@wp.func_native(nearest_stack_code("nearest_stack"))
+@native.func_native()
 def nearest_stack() -> wp.uint64:
     """Return the address of this warp's lists, in shared memory on CUDA, each entry's bound behind them.
 
@@ -22,15 +19,15 @@ def nearest_stack() -> wp.uint64:
     """
 
 
-@wp.func_native(nearest_stack_code("read_bound"))
+@native.func_native()
 def read_bound(items: wp.uint64, i: wp.int32) -> wp.float32: ...
 
 
-@wp.func_native(nearest_stack_code("write_bound"))
+@native.func_native()
 def write_bound(items: wp.uint64, i: wp.int32, bound: wp.float32): ...
 
 
-@wp.func_native(nearest_stack_code("push_nearest"))
+@native.func_native()
 def push_nearest(
     items: wp.uint64, end: wp.int32, leaf_end: wp.int32, kinds: wp.vec4i, children: four_items, bounds: wp.vec4
 ) -> wp.int64:
@@ -40,6 +37,6 @@ def push_nearest(
     """
 
 
-@wp.func_native(nearest_stack_code("push_open"))
+@native.func_native()
 def push_open(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64, bound: wp.float32) -> wp.int32:
     """Append the face pairs whose flag is set to those for float64; return the new end."""

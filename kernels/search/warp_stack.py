@@ -3,8 +3,6 @@
 All lanes must reach these functions together, but for those that read or write one entry.
 """
 
-import functools
-
 import warp as wp
 
 from warp_abtree.kernels import native
@@ -17,10 +15,7 @@ STRADDLING_START = native.constant("STRADDLING_START")
 SLAB_PAIR_START, SLAB_PAIR_LENGTH = native.constant("SLAB_PAIR_START"), native.constant("SLAB_PAIR_LENGTH")
 
 
-warp_stack_code = functools.partial(native.body, "search/warp_stack.cuh")
-
-
-@wp.func_native(warp_stack_code("warp_stack"))
+@native.func_native()
 def warp_stack() -> wp.uint64:
     """Return the address of this warp's items, in shared memory on CUDA.
 
@@ -29,15 +24,15 @@ def warp_stack() -> wp.uint64:
     """
 
 
-@wp.func_native(warp_stack_code("read_item"))
+@native.func_native()
 def read_item(items: wp.uint64, i: wp.int32) -> wp.int64: ...
 
 
-@wp.func_native(warp_stack_code("write_item"))
+@native.func_native()
 def write_item(items: wp.uint64, i: wp.int32, item: wp.int64): ...
 
 
-@wp.func_native(native.body("search/push_children.cuh", "push_children"))
+@native.func_native()
 def push_children(items: wp.uint64, ends: wp.vec3i, lists: wp.vec4i, children: four_items) -> wp.vec3i:
     """Append children to the lists that they are for, if any, see `node_pair`.
 
@@ -45,31 +40,31 @@ def push_children(items: wp.uint64, ends: wp.vec3i, lists: wp.vec4i, children: f
     """
 
 
-@wp.func_native(warp_stack_code("push_items"))
+@native.func_native()
 def push_items(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64) -> wp.int32:
     """Append the items whose flag is set to the stack; return its new end."""
 
 
-@wp.func_native(warp_stack_code("push_straddling"))
+@native.func_native()
 def push_straddling(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64, signs: wp.int32) -> wp.int32:
     """Append the leaf pairs whose flag is set, with their signs, to the straddling pairs; return the new end."""
 
 
-@wp.func_native(warp_stack_code("read_signs"))
+@native.func_native()
 def read_signs(items: wp.uint64, i: wp.int32) -> wp.int32:
     """Return the signs of the i-th straddling pair."""
 
 
-@wp.func_native(warp_stack_code("signed_pairs"))
+@native.func_native()
 def signed_pairs() -> wp.uint64:
     """Return the address of this warp's face pairs with their signs, in shared memory on CUDA."""
 
 
-@wp.func_native(warp_stack_code("push_signed_pair"))
+@native.func_native()
 def push_signed_pair(list: wp.uint64, end: wp.int32, flag: bool, item: wp.vec3i, signs: wp.int32) -> wp.int32:
     """Append the face pairs whose flag is set, with their signs, to a list; return the new end."""
 
 
-@wp.func_native(warp_stack_code("read_signed_pair"))
+@native.func_native()
 def read_signed_pair(list: wp.uint64, i: wp.int32) -> wp.vec4i:
     """Return the i-th face pair of a list, and its signs."""

@@ -30,7 +30,7 @@ def load_triangles(trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.in
     return scale_triangles(a0, a1, a2, b0, b1, b2)
 
 
-@wp.func_native(native.body("base/numbers.cuh", "load_corner"))
+@native.func_native()
 def load_corner(corners: wp.array(dtype=wp.vec4i), i: wp.int32) -> wp.vec4i: ...
 
 

@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 three_points = wp.types.matrix(shape=(3, 3), dtype=wp.float32)
 
 
-@wp.func_native(native.body("distance/bound_faces.cuh", "bound_faces"))
+@native.func_native()
 def bound_faces(own: wp.float32, a: three_points, b: three_points) -> wp.vec2:
     """Return a lower and an upper bound of the distance of two triangles, their corners in rows.
 

@@ -52,7 +52,7 @@ def sum_sizes(v: wp.vec3):
     return (wp.abs(v[0]) + wp.abs(v[1])) + wp.abs(v[2])
 
 
-@wp.func_native(native.body("base/numbers.cuh", "largest"))
+@native.func_native()
 def largest(x: wp.float32, y: wp.float32, z: wp.float32) -> wp.float32:
     """Return the largest of three; on the CPU without the branches that `wp.max` has for NaN, which may pass by."""
 
@@ -80,12 +80,12 @@ def heights_over_plane(
     return wp.vec3(dot32(w0, normal), dot32(w1, normal), dot32(w2, normal)), bound
 
 
-@wp.func_native(native.body("base/numbers.cuh", "one_sided"))
+@native.func_native()
 def one_sided(x: wp.vec3, bound: wp.float32) -> wp.int32:
     """Return a negative number where three numbers that err by at most a bound have the same sign, not 0."""
 
 
-@wp.func_native(native.body("base/numbers.cuh", "add_signs"))
+@native.func_native()
 def add_signs(signs: wp.int32, x: wp.vec3, bound: wp.float32) -> wp.int32:
     """Return signs with those of three more numbers after them."""
 

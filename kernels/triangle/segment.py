@@ -67,12 +67,12 @@ def signed_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
     return value
 
 
-@wp.func_native(native.body("base/numbers.cuh", "shares_reciprocal"))
+@native.func_native()
 def shares_reciprocal(v: wp.vec3d, s: wp.float64) -> bool:
     """Return whether `multiply_reciprocal` rounds as a division does."""
 
 
-@wp.func_native(native.body("base/numbers.cuh", "multiply_reciprocal"))
+@native.func_native()
 def multiply_reciprocal(v: wp.vec3d, s: wp.float64) -> wp.vec3d: ...
 
 

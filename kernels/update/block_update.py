@@ -16,7 +16,7 @@ from warp_abtree.kernels.update.refit import refit_inner, refit_leaf, unite_node
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
 
 BLOCK_THREADS = 1024  # of a block, where there are few states or deep trees
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = native.options("base/lanes.cuh", "update/block_marks.cuh")
 wp.set_module_options(MODULE_OPTIONS)
 
 BLOCK_DEPTH = native.constant("BLOCK_DEPTH")  # of the deepest tree that a block updates
@@ -27,47 +27,45 @@ MARK_WORDS = native.constant("MARK_WORDS")
 MARK_START = wp.constant(native.constant("MARK_START"))
 CHANGED_COUNT, MARKED_COUNT = wp.constant(0), wp.constant(1)
 
-marks_code = functools.partial(native.body, "update/block_marks.cuh")
 
-
-@wp.func_native(marks_code("block_marks"))
+@native.func_native()
 def block_marks(scratch: wp.array(dtype=wp.uint32)) -> wp.uint64:
     """Return the address of this block's marks: in shared memory on CUDA, on the CPU that of `scratch`."""
 
 
-@wp.func_native(marks_code("shallow_marks"))
+@native.func_native()
 def shallow_marks(scratch: wp.array(dtype=wp.uint32)) -> wp.uint64:
     """Return the same for trees of SHALLOW_DEPTH at most."""
 
 
-@wp.func_native(marks_code("read_word"))
+@native.func_native()
 def read_word(marks: wp.uint64, i: wp.int32) -> wp.uint32: ...
 
 
-@wp.func_native(marks_code("clear_word"))
+@native.func_native()
 def clear_word(marks: wp.uint64, i: wp.int32): ...
 
 
-@wp.func_native(marks_code("add_to_word"))
+@native.func_native()
 def add_to_word(marks: wp.uint64, i: wp.int32, amount: wp.int32): ...
 
 
-@wp.func_native(marks_code("mark_bit"))
+@native.func_native()
 def mark_bit(marks: wp.uint64, bit: wp.int32) -> bool:
     """Set a bit, and return whether it was not set."""
 
 
-@wp.func_native(marks_code("unmark_bit"))
+@native.func_native()
 def unmark_bit(marks: wp.uint64, bit: wp.int32) -> bool:
     """Clear a bit, and return whether it was set; the thread that finds it clear sees what the other has written."""
 
 
-@wp.func_native(marks_code("fetch_entry"))
+@native.func_native()
 def fetch_entry(values: wp.array(dtype=wp.vec4), i: wp.int64):
     """Prefetch an entry."""
 
 
-@wp.func_native(marks_code("fetch_corner"))
+@native.func_native()
 def fetch_corner(values: wp.array(dtype=wp.vec4i), i: wp.int32): ...
 
 

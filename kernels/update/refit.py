@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool, load_vertex
 from warp_abtree.kernels.base.boxes import round_down_vec, round_up_vec
 from warp_abtree.kernels.base.lanes import block_sync
@@ -9,7 +10,7 @@ from warp_abtree.kernels.base.nodes import Node, empty_node, load_node, store_no
 from warp_abtree.kernels.update.work_lists import UpdateLists
 
 TOP_THREADS = 512  # of the block that refits the levels next to the root
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = native.options("base/lanes.cuh")
 wp.set_module_options(MODULE_OPTIONS)
 
 

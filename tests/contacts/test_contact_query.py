@@ -9,9 +9,10 @@ from helpers.samples import STILL, contact_poses, sample
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.kernels import native
 from warp_abtree.kernels.triangle.segment import divide_vector
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options())
 
 
 def teeth(count, seed, points=False):

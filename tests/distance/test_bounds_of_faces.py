@@ -9,12 +9,13 @@ from oracles.triangle_distance import triangle_distance
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.distance.frame import make_scale, slack_of
 from warp_abtree.kernels.triangle.distance_bounds import bound_faces, three_points
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("distance/bound_faces.cuh"))
 
 # Distances of these, corners of A and of B, are too short in float32 by 7.0 u of what joins corners, too long by 5.1 u
 # and, where they are small, by 8.9 u: a search found them. Bounds have 48 u and, where it is small, 256 u.

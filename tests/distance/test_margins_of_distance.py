@@ -220,4 +220,4 @@ def test_slabs_leave_off_what_roundings_add_up_to():
     along, across = (17.6, 26.9, 8.3), (25, 37, 27)
     room = float(BOUND_MARGINS) / 2 * float(ROUNDING_32) / 2.0**-24
     assert room >= max(*along, *across) and int(BOUND_MARGINS) == native.constant("SLAB_MARGINS")
-    assert "boxes.margin = SLAB_MARGINS * scaling.margin;" in native.body("distance/search.h", "search_nearest")
+    assert "boxes.margin = SLAB_MARGINS * scaling.margin;" in native.read("distance/search.h")

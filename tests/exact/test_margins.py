@@ -15,10 +15,11 @@ from oracles.signs import true_signs
 from oracles.triangle import into_frame_of_a, quaternion_matrix, triangles_intersect
 
 import warp_abtree as ab
+from warp_abtree.kernels import native
 from warp_abtree.kernels.exact.predicates import UNCERTAIN
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, side_of_plane
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options())
 
 U = 2.0**-24
 STILL = np.eye(4)

@@ -22,6 +22,8 @@ from warp_abtree.kernels.exact.expansion import two_sum
 from warp_abtree.kernels.exact.predicates import BOUND_2D, BOUND_3D, EXACT, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.intersect import dual_tree, simd, uncertain_pairs
 from warp_abtree.kernels.intersect.face_pairs import WITHIN
+from warp_abtree.kernels.motion.linear import LinearMotion
+from warp_abtree.kernels.motion.path import Motion
 from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR
 
 DOUBLES = {
@@ -102,20 +104,81 @@ def test_ptx_of_the_traversal_is_not_contracted(tmp_path, case):
 
 
 FILES = sorted(path.relative_to(native.FOLDER).as_posix() for path in native.FOLDER.rglob("*.*h"))
+FUNCTION = re.compile(r"^[^\s#/][^\n;]*? (\w+)\(((?:[^()]|\(\))*)\) \{", re.M)
+MODULES = [info.name for info in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}.") if not info.ispkg]
+
+
+def functions_of_headers():
+    """Yield the name of every function of a header, its parameters' names, and the header."""
+    for file in FILES:
+        for name, text in FUNCTION.findall(native.read(file)):
+            parts = re.sub(r"<[^<>]*>", "", re.sub(r"<[^<>]*>", "", text)).split(",")
+            yield name, [part.split()[-1].lstrip("&") for part in parts if part.strip()], file
+
+
+def called(function):
+    """Return the name of the header's function that a stub calls, or nothing."""
+    return "".join(re.findall(r"ab::(\w+)\(", getattr(function, "native_snippet", None) or ""))
 
 
 def test_every_function_has_one_stub_of_its_name_and_parameters():
-    functions = [(file, name, *native.functions(file)[name]) for file in FILES for name in native.functions(file)]
-    written = [(name, parameters, code) for _, name, parameters, code in functions]
-    bodies = {code for _, _, code in written}
-    found = []
-    for info in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}."):
-        for name, function in vars(importlib.import_module(info.name)).items() if info.name != native.__name__ else ():
-            snippet = getattr(function, "native_snippet", None)
-            if snippet in bodies and function.func.__module__ == info.name:
-                assert (name, list(inspect.signature(function.func).parameters), snippet) in written
-                found.append(name)
-    assert sorted(found) == sorted(name for _, name, _, _ in functions)
+    stubs = []
+    for name in MODULES:
+        for function in vars(importlib.import_module(name)).values():
+            if called(function) and function.func.__module__ == name:
+                stubs.append((called(function), list(inspect.signature(function.func).parameters)))
+                file = next(file for found, _, file in functions_of_headers() if found == called(function))
+                assert file.endswith(".h") == ("__trap" in function.native_snippet), "a .h is for the CPU"
+    without = [name for name, parameters, _ in functions_of_headers() if (name, parameters) not in stubs]
+    assert len(stubs) + len(without) == len([*functions_of_headers()])
+    text = "".join(map(native.read, FILES))
+    assert [name for name in without if len(re.findall(rf"\b{name}\b", text)) < 2] == [], "no header calls it"
+
+
+def reached(adjoint, found):
+    """Add the functions that a kernel or function calls, and those that they call."""
+    for function in adjoint.get_references()[2]:
+        overloads = getattr(function, "user_overloads", {}) | getattr(function, "user_templates", {})
+        for each in (function, *overloads.values()):
+            if hasattr(each, "adj") and each not in found:
+                found.add(each)
+                reached(each.adj, found)
+    return found
+
+
+MAKERS = {
+    "contacts.points": [lambda made: made.point_spreader(4)],
+    "intersect.dual_tree": [lambda made: made.warp_traversal(int(EXACT), False)],
+    "intersect.relative_pose": [lambda made: made.relative_poses(False)],
+    "intersect.simd": [lambda made: made.thread_traversal(int(EXACT))],
+    "io.contact_results": [lambda made: made.contact_packer(wp.float64, True)],
+    "motion.group": [lambda made: made.warp_search(Motion), lambda made: made.warp_search(LinearMotion)],
+    "motion.search": [lambda made: made.thread_search(Motion), lambda made: made.thread_search(LinearMotion)],
+    "update.block_update": [lambda made: made.state_update(True)],
+}
+
+
+def test_modules_name_the_headers_that_their_kernels_need():
+    """No fewer, which would not compile, and no more: each that is parsed takes time before the first answer."""
+    header_of = {name: file for name, _, file in functions_of_headers()}
+    texts = {file: native.INCLUDE.sub("", native.read(file)) for file in FILES}
+    for name in MODULES:
+        python, group = importlib.import_module(name), name.removeprefix(f"{kernels.__name__}.")
+        found = [value for value in vars(python).values() if isinstance(value, wp.Kernel)]
+        found += [make(python) for make in MAKERS.get(group, ())]
+        needed = {file for file in native.BASE}
+        needed |= {header_of[called(f)] for kernel in found for f in reached(kernel.adj, set()) if called(f)}
+        given = [kernel.module.options["extra_build_options"] for kernel in found]
+        preambles = {options.extra_cpu_preamble for options in given if options}
+        parsed = {file for file in FILES if any(texts[file] in preamble for preamble in preambles)}
+        assert not preambles or texts.keys() & parsed == closure(needed), name
+
+
+def closure(files):
+    texts = {}
+    for file in files:
+        native.add_header(texts, file)
+    return texts.keys()
 
 
 def test_constants_are_those_of_python():
@@ -126,7 +189,7 @@ def test_constants_are_those_of_python():
 
 
 def compile_alone(text, folder):
-    """Compile C++ by Warp's own clang; return whether it did."""
+    """Compile C++ by Warp's own clang, with the folder of headers to include from; return whether it did."""
     build = pytest.importorskip("warp._src.build", reason="where Warp keeps its compiler")
     source = folder / "alone.cpp"
     source.write_text(f"#define WP_NO_CRT\n{text}")
@@ -138,10 +201,17 @@ def compile_alone(text, folder):
     return True
 
 
-def test_included_files_are_part_of_the_text():
+def test_preamble_holds_each_header_once_after_what_it_includes():
     """Warp hashes the text, so that a change of any file compiles anew."""
-    assert "struct WideInteger" in native.body("exact/int128.h", "integer_orient3d")
-    assert not any("#include" in body for file in FILES for _, body in native.functions(file).values())
+    text = native.options("exact/determinant.cuh", "contacts/contacts.h")["extra_build_options"].extra_cpu_preamble
+    assert "#include" not in text and "#pragma once" not in text
+    places = [text.index(f"{word} {{") for word in ("struct Float64", "struct Double64", "struct Contact64")]
+    assert places == sorted(places) and text.count("struct Float64 {") == text.count("struct WideInteger {") == 1
+
+
+def test_cuda_does_not_parse_headers_of_the_cpu():
+    options = native.options("search/slabs.cuh", "contacts/contacts.h")["extra_build_options"]
+    assert "struct Contact64" not in options.extra_cuda_preamble and "is_last_block" in options.extra_cuda_preamble
 
 
 @pytest.mark.parametrize("files", [FILES, *slow(*([file] for file in FILES))], ids=lambda files: "+".join(files)[:20])

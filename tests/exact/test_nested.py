@@ -9,6 +9,7 @@ from helpers.samples import STILL, random_poses, sample, true_faces
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.intersect import descent
@@ -21,7 +22,7 @@ from warp_abtree.kernels.intersect.descent import (
 )
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("intersect/open_subtrees.h", "intersect/subtrees.h"))
 
 CPU = "cpu"
 AT_ONCE = 100  # leaf pairs that a test waits for

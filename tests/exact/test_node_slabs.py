@@ -12,12 +12,13 @@ from oracles.triangle import into_frame_of_a, quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import SLAB_DEPTH, PairBatch
 from warp_abtree.kernels.search.item import pack_item
 from warp_abtree.kernels.search.slab_overlap import DIRECTION_LENGTH, slabs_overlap
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options())
 
 
 def read_slabs(device, model):

@@ -8,6 +8,7 @@ import warp as wp
 from helpers.questions import launch
 from oracles.signs import COUNT, KINDS, random_floats, rounded_signs, true_signs, true_terms
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.exact.double_word import double_orient2d, double_orient3d
 from warp_abtree.kernels.exact.exact import exact_orient2d, exact_orient3d, exact_volume
 from warp_abtree.kernels.exact.expansion import EXPANSION_LANES, expand_area, expand_volume, two_product, two_sum
@@ -16,7 +17,7 @@ from warp_abtree.kernels.exact.predicates import UNCERTAIN, orient2d, orient3d, 
 from warp_abtree.kernels.triangle import float32_filter
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, add_signs, heights_over_plane, side_of_plane
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("exact/determinant.cuh", "exact/expansion.cuh"))
 
 
 @wp.kernel

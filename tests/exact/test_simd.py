@@ -9,6 +9,7 @@ from helpers.questions import GpuQuery, scene_of
 from helpers.samples import STILL, contact_poses, sample
 
 from warp_abtree import testing
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.exact.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
@@ -21,7 +22,15 @@ from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, SEPARATED
 
 pytestmark = pytest.mark.slow
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(
+    native.options(
+        "base/lanes.cuh",
+        "exact/determinant.cuh",
+        "intersect/descend.h",
+        "intersect/float32_filter.h",
+        "intersect/float64_filter.h",
+    )
+)
 
 CPU = "cpu"
 UNTOUCHED, OVER = -77, 16  # OVER: what vector instructions may write behind a list

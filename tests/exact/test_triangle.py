@@ -8,12 +8,13 @@ import warp as wp
 from helpers.questions import launch
 from oracles import triangle as oracle
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.exact.predicates import EXACT, FILTER, UNCERTAIN
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
 
 pytestmark = pytest.mark.slow
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("base/lanes.cuh", "exact/determinant.cuh"))
 
 
 @wp.kernel

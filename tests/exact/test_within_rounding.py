@@ -13,13 +13,14 @@ from helpers.questions import ask, launch
 from helpers.samples import random_quaternions
 
 import warp_abtree as ab
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.boxes import boxes_overlap, pose_box
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import pair_pose
 from warp_abtree.kernels.triangle.distance import triangles_near
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options())
 
 FACE = [[0, 1, 2]]
 SKEW = 2.0**-22  # scenes refuse a frame that is off by 10^-6

@@ -12,9 +12,10 @@ from oracles.inside import components, parity, solids_intersect
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
+from warp_abtree.kernels import native
 from warp_abtree.kernels.inside.parity import Ray, crosses_face
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("exact/determinant.cuh"))
 
 BOX = ab.Model.load(trimesh.creation.box((4, 4, 4)))
 BALL = ab.Model.load(trimesh.creation.icosphere(2, 0.5))

@@ -8,6 +8,7 @@ from helpers.questions import launch
 from oracles.path import HAS_LONG, LONG, apply, invert
 
 import warp_abtree as ab
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, Trees
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import place_trees
@@ -34,7 +35,7 @@ class View:
     box_b: Seen
 
 
-@wp.kernel(module="unique", module_options={"fuse_fp": False})
+@wp.kernel(module="unique", module_options=native.options())
 def view_kernel(ends: ObjectPool, trees: Trees, times: wp.array(dtype=wp.float64), view_out: wp.array(dtype=View)):
     i = wp.tid()
     t, a, b, o = times[i], 2 * i, 2 * i + 1, wp.vec3()

@@ -12,6 +12,7 @@ from oracles.path import HAS_LONG, LONG, apply, frames_at, move, seen_from, shor
 from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import place_trees
@@ -43,7 +44,7 @@ class Seen:
     box_b: MovingBox
 
 
-@wp.kernel(module="unique", module_options={"fuse_fp": False})
+@wp.kernel(module="unique", module_options=native.options())
 def see_kernel(paths: Paths, trees: Trees, times: wp.array(dtype=wp.float64), seen_out: wp.array(dtype=Seen)):
     i = wp.tid()
     a, b = 2 * i, 2 * i + 1

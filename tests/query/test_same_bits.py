@@ -12,6 +12,7 @@ from helpers.scenes import add_objects
 import warp_abtree as ab
 from warp_abtree import testing
 from warp_abtree.checks.cpu_threads import cores_for, launch_on_cores
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.counters import take_slots
 
 MODELS = ("torus", "small ball", "box", "crumbs", "soup", "twins")
@@ -95,7 +96,7 @@ def test_a_capture_records_all_threads():
     np.testing.assert_array_equal(query.result().faces, expected)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=native.options("base/counters.cuh"))
 def count_item_kernel(count: int, taken: wp.array[int], seen: wp.array[int]):
     i = take_slots(taken, 1)
     while i < count:

@@ -4,8 +4,7 @@
 
 // Of the edge on top of the heap all that lies about it; of the four below it their nodes.
 template <class Surface, class Rings, class Heap>
-void fetch_edges(Surface surface, Rings rings, Heap heap, wp::int32 size) {
-#if !defined(__CUDA_ARCH__)
+void fetch_edges(const Surface& surface, const Rings& rings, const Heap& heap, wp::int32 size) {
     auto fetch_node = [&](int node) {
         __builtin_prefetch(surface.pos.data + node);
         __builtin_prefetch(surface.quadric.data + node);
@@ -31,13 +30,11 @@ void fetch_edges(Surface surface, Rings rings, Heap heap, wp::int32 size) {
             }
         }
     }
-#endif
 }
 
 // Of the children of the four entries from `child` on, before it is known whose are needed.
 template <class Heap>
-void fetch_entries(Heap heap, wp::int32 child) {
-#if !defined(__CUDA_ARCH__)
+void fetch_entries(const Heap& heap, wp::int32 child) {
     const wp::int64 first = 4 * (wp::int64)child + 1;
     for (int i = 0; i < 16; i += 8) {
         __builtin_prefetch(heap.key.data + first + i);
@@ -45,5 +42,4 @@ void fetch_entries(Heap heap, wp::int32 child) {
     }
     __builtin_prefetch(heap.key.data + first + 15);
     __builtin_prefetch(heap.pair.data + first + 15);
-#endif
 }

@@ -5,9 +5,7 @@
 
 // Of the merge after `j` all that lies about it, of a later one its two nodes.
 template <class Replay, class Pairs>
-void fetch_merge(Replay replay, Pairs merge_pair, wp::int32 merge_count, wp::int32 j) {
-#if !defined(__CUDA_ARCH__)
-#include "base/sizes.h"
+void fetch_merge(const Replay& replay, const Pairs& merge_pair, wp::int32 merge_count, wp::int32 j) {
     const int *pair = merge_pair.data, *head = replay.rings.head.data, *next = replay.rings.next.data;
     const int *corner_node = replay.rings.corner_node.data, *slots = replay.slot.data;
     const double *pos = (const double*)replay.pos.data, *corners = (const double*)replay.triangle_pos.data;
@@ -53,5 +51,4 @@ void fetch_merge(Replay replay, Pairs merge_pair, wp::int32 merge_count, wp::int
         }
         lists = kept;
     }
-#endif
 }

@@ -123,4 +123,40 @@ struct PolygonCuts {
         near.measure(middle, row);
         return split(p, top, near.nearest(row, here), 0x1p-46 + 0.05 * wp::sqrt(limit));
     }
+    // As `cover_triangle`, of the one polygon on the stack; false where that has to do it.
+    bool cover(double& limit, int (&used)[COVER_SLOTS], int& count) {
+        int top = 1, split = 0;
+        count = 0;
+        while (top > 0) {
+            Polygon p = stack[--top];
+            double bound;
+            const int best = near.cover(p, limit, bound);
+            bool final = bound <= limit;
+            if (!final) {
+                const double least = near.reach(p);
+                if (least > limit)
+                    return false;  // another face may be nearer
+                const double enough = 1.1 * least > limit ? 1.1 * least : limit;
+                final =
+                    bound <= enough || split >= COVER_CUTS || top + 4 >= POLYGON_STACK || p.count + 4 > POLYGON_CORNERS;
+            }
+            if (final) {
+                int at = 0;
+                while (at < count && used[at] != best)
+                    ++at;
+                if (at == COVER_SLOTS)
+                    return false;
+                count += at == count;
+                used[at] = used[count - 1];
+                used[count - 1] = best;
+                limit = bound > limit ? bound : limit;
+            } else {
+                ++split;
+                top = split_at_middle(p, top, limit);
+                if (top < 0)
+                    return false;
+            }
+        }
+        return true;
+    }
 };

@@ -5,128 +5,107 @@
 #include "contacts/contact64.h"
 
 template <class Contacts>
-wp::vec_t<6, wp::float64> simd_sum_lengths(Contacts contacts, wp::vec_t<2, wp::int32> ends) {
-    wp::vec_t<6, wp::float64> result;
-#if defined(__CUDA_ARCH__)
-    __trap();  // a warp sums a chunk
-#else
-    {
+wp::vec_t<6, wp::float64> simd_sum_lengths(const Contacts& contacts, wp::vec_t<2, wp::int32> ends) {
 #pragma clang fp contract(off)
-#include "contacts/contact64.h"
-        typedef Contact64 C;
-        C::lanes length, crossed;
-        double sum[2] = {};
-        for (int i = ends[0]; i < ends[1]; i += 8) {
-            const int count = ends[1] - i < 8 ? ends[1] - i : 8;
-            C::load_crossed(contacts.separation.data, contacts.separation.shape[0] != 0, i, count, crossed);
-            length = crossed * C::measure_length(Float64::minus(C::load((const double*)(contacts.p1.data + i), count),
-                                                                C::load((const double*)(contacts.p0.data + i), count)));
-            for (int k = 0; k < count; ++k) {
-                sum[0] += length[k];
-                sum[1] += crossed[k];
+    wp::vec_t<6, wp::float64> result;
+    typedef Contact64 C;
+    C::lanes length, crossed;
+    double sum[2] = {};
+    for (int i = ends[0]; i < ends[1]; i += 8) {
+        const int count = ends[1] - i < 8 ? ends[1] - i : 8;
+        C::load_crossed(contacts.separation.data, contacts.separation.shape[0] != 0, i, count, crossed);
+        length = crossed * C::measure_length(Float64::minus(C::load((const double*)(contacts.p1.data + i), count),
+                                                            C::load((const double*)(contacts.p0.data + i), count)));
+        for (int k = 0; k < count; ++k) {
+            sum[0] += length[k];
+            sum[1] += crossed[k];
+        }
+        if ((i + count - ends[0]) % CHUNK == 0 || i + count == ends[1])
+            for (int c = 0; c < 2; ++c) {
+                result[c] += sum[c];
+                sum[c] = 0.0;
             }
-            if ((i + count - ends[0]) % CHUNK == 0 || i + count == ends[1])
-                for (int c = 0; c < 2; ++c) {
-                    result[c] += sum[c];
-                    sum[c] = 0.0;
-                }
-        }
     }
-#endif
     return result;
 }
 
 template <class Contacts>
-wp::vec_t<6, wp::float64> simd_sum_means(Contacts contacts, wp::vec_t<2, wp::int32> ends, wp::float64 total,
+wp::vec_t<6, wp::float64> simd_sum_means(const Contacts& contacts, wp::vec_t<2, wp::int32> ends, wp::float64 total,
                                          wp::float64 number) {
-    wp::vec_t<6, wp::float64> result;
-#if defined(__CUDA_ARCH__)
-    __trap();  // a warp sums a chunk
-#else
-    {
 #pragma clang fp contract(off)
-#include "contacts/contact64.h"
-        typedef Contact64 C;
-        typedef C::Point Point;
-        const wp::vec_t<3, wp::float64> first = contacts.p0.data[ends[0]];
-        const Point origin = {C::lanes{} + first[0], C::lanes{} + first[1], C::lanes{} + first[2]};
-        double sum[6] = {};
-        for (int i = ends[0]; i < ends[1]; i += 8) {
-            const int count = ends[1] - i < 8 ? ends[1] - i : 8;
-            C::lanes crossed;
-            C::load_crossed(contacts.separation.data, contacts.separation.shape[0] != 0, i, count, crossed);
-            const Point p0 = C::load((const double*)(contacts.p0.data + i), count);
-            const Point p1 = C::load((const double*)(contacts.p1.data + i), count);
-            const Point normal = C::load((const double*)(contacts.normal.data + i), count);
-            C::lanes weight = C::lanes{} + 1.0 / number;
-            if (total != 0.0)
-                weight = C::measure_length(Float64::minus(p1, p0)) / total;
-            weight = crossed == 0.0 ? C::lanes{} : weight;
-            const Point a = Float64::minus(p0, origin), b = Float64::minus(p1, origin);
-            const C::lanes x[6] = {weight * (0.5 * a.x + 0.5 * b.x),
-                                   weight * (0.5 * a.y + 0.5 * b.y),
-                                   weight * (0.5 * a.z + 0.5 * b.z),
-                                   weight * normal.x,
-                                   weight * normal.y,
-                                   weight * normal.z};
-            for (int k = 0; k < count; ++k)
-                for (int c = 0; c < 6; ++c)
-                    sum[c] += x[c][k];
-            if ((i + count - ends[0]) % CHUNK == 0 || i + count == ends[1])
-                for (int c = 0; c < 6; ++c) {
-                    result[c] += sum[c];
-                    sum[c] = 0.0;
-                }
-        }
+    wp::vec_t<6, wp::float64> result;
+    typedef Contact64 C;
+    typedef C::Point Point;
+    const wp::vec_t<3, wp::float64> first = contacts.p0.data[ends[0]];
+    const Point origin = {C::lanes{} + first[0], C::lanes{} + first[1], C::lanes{} + first[2]};
+    double sum[6] = {};
+    for (int i = ends[0]; i < ends[1]; i += 8) {
+        const int count = ends[1] - i < 8 ? ends[1] - i : 8;
+        C::lanes crossed;
+        C::load_crossed(contacts.separation.data, contacts.separation.shape[0] != 0, i, count, crossed);
+        const Point p0 = C::load((const double*)(contacts.p0.data + i), count);
+        const Point p1 = C::load((const double*)(contacts.p1.data + i), count);
+        const Point normal = C::load((const double*)(contacts.normal.data + i), count);
+        C::lanes weight = C::lanes{} + 1.0 / number;
+        if (total != 0.0)
+            weight = C::measure_length(Float64::minus(p1, p0)) / total;
+        weight = crossed == 0.0 ? C::lanes{} : weight;
+        const Point a = Float64::minus(p0, origin), b = Float64::minus(p1, origin);
+        const C::lanes x[6] = {weight * (0.5 * a.x + 0.5 * b.x),
+                               weight * (0.5 * a.y + 0.5 * b.y),
+                               weight * (0.5 * a.z + 0.5 * b.z),
+                               weight * normal.x,
+                               weight * normal.y,
+                               weight * normal.z};
+        for (int k = 0; k < count; ++k)
+            for (int c = 0; c < 6; ++c)
+                sum[c] += x[c][k];
+        if ((i + count - ends[0]) % CHUNK == 0 || i + count == ends[1])
+            for (int c = 0; c < 6; ++c) {
+                result[c] += sum[c];
+                sum[c] = 0.0;
+            }
     }
-#endif
     return result;
 }
 
 template <class Contacts>
-wp::vec_t<6, wp::float64> simd_sum_areas(Contacts contacts, wp::vec_t<2, wp::int32> ends,
+wp::vec_t<6, wp::float64> simd_sum_areas(const Contacts& contacts, wp::vec_t<2, wp::int32> ends,
                                          wp::vec_t<3, wp::float64> middle, wp::vec_t<3, wp::float64> normal) {
-    wp::vec_t<6, wp::float64> result;
-#if defined(__CUDA_ARCH__)
-    __trap();  // a warp sums a chunk
-#else
-    {
 #pragma clang fp contract(off)
-#include "contacts/contact64.h"
-        typedef Contact64 C;
-        typedef C::Point Point;
-        const auto spread = [](const wp::vec_t<3, wp::float64>& v) {
-            return Point{C::lanes{} + v[0], C::lanes{} + v[1], C::lanes{} + v[2]};
-        };
-        const Point origin = spread(contacts.p0.data[ends[0]]), centre = spread(middle), n = spread(normal);
-        double sum[2] = {};
-        for (int i = ends[0]; i < ends[1]; i += 8) {
-            const int count = ends[1] - i < 8 ? ends[1] - i : 8;
-            C::lanes crossed;
-            C::load_crossed(contacts.separation.data, contacts.separation.shape[0] != 0, i, count, crossed);
-            for (int k = 0; k < count; ++k)
-                crossed[k] = contacts.coplanar.data[i + k] == 0 ? crossed[k] : 0.0;
-            const Point p0 = C::load((const double*)(contacts.p0.data + i), count);
-            const Point s = Float64::minus(C::load((const double*)(contacts.p1.data + i), count), p0);
-            const Point r = Float64::minus(Float64::minus(p0, origin), centre);
-            const Point a = C::load((const double*)(contacts.normal_a.data + i), count);
-            const Point b = C::load((const double*)(contacts.normal_b.data + i), count);
-            // As `loop_change`.
-            const C::lanes cosine = C::dot(a, b), square = 1.0 - cosine * cosine, y = C::dot(n, b) / square;
-            const Point across = {b.x - a.x * cosine, b.y - a.y * cosine, b.z - a.z * cosine};
-            const C::lanes change = square < LEAST_SINE_SQUARED ? C::lanes{} : y * C::dot(across, C::cross(s, n));
-            const C::lanes area = 0.5 * C::dot(n, C::cross(r, s));
-            const C::lanes x[2] = {crossed == 0.0 ? C::lanes{} : area, crossed == 0.0 ? C::lanes{} : change};
-            for (int k = 0; k < count; ++k)
-                for (int c = 0; c < 2; ++c)
-                    sum[c] += x[c][k];
-            if ((i + count - ends[0]) % CHUNK == 0 || i + count == ends[1])
-                for (int c = 0; c < 2; ++c) {
-                    result[c] += sum[c];
-                    sum[c] = 0.0;
-                }
-        }
+    wp::vec_t<6, wp::float64> result;
+    typedef Contact64 C;
+    typedef C::Point Point;
+    const auto spread = [](const wp::vec_t<3, wp::float64>& v) {
+        return Point{C::lanes{} + v[0], C::lanes{} + v[1], C::lanes{} + v[2]};
+    };
+    const Point origin = spread(contacts.p0.data[ends[0]]), centre = spread(middle), n = spread(normal);
+    double sum[2] = {};
+    for (int i = ends[0]; i < ends[1]; i += 8) {
+        const int count = ends[1] - i < 8 ? ends[1] - i : 8;
+        C::lanes crossed;
+        C::load_crossed(contacts.separation.data, contacts.separation.shape[0] != 0, i, count, crossed);
+        for (int k = 0; k < count; ++k)
+            crossed[k] = contacts.coplanar.data[i + k] == 0 ? crossed[k] : 0.0;
+        const Point p0 = C::load((const double*)(contacts.p0.data + i), count);
+        const Point s = Float64::minus(C::load((const double*)(contacts.p1.data + i), count), p0);
+        const Point r = Float64::minus(Float64::minus(p0, origin), centre);
+        const Point a = C::load((const double*)(contacts.normal_a.data + i), count);
+        const Point b = C::load((const double*)(contacts.normal_b.data + i), count);
+        // As `loop_change`.
+        const C::lanes cosine = C::dot(a, b), square = 1.0 - cosine * cosine, y = C::dot(n, b) / square;
+        const Point across = {b.x - a.x * cosine, b.y - a.y * cosine, b.z - a.z * cosine};
+        const C::lanes change = square < LEAST_SINE_SQUARED ? C::lanes{} : y * C::dot(across, C::cross(s, n));
+        const C::lanes area = 0.5 * C::dot(n, C::cross(r, s));
+        const C::lanes x[2] = {crossed == 0.0 ? C::lanes{} : area, crossed == 0.0 ? C::lanes{} : change};
+        for (int k = 0; k < count; ++k)
+            for (int c = 0; c < 2; ++c)
+                sum[c] += x[c][k];
+        if ((i + count - ends[0]) % CHUNK == 0 || i + count == ends[1])
+            for (int c = 0; c < 2; ++c) {
+                result[c] += sum[c];
+                sum[c] = 0.0;
+            }
     }
-#endif
     return result;
 }

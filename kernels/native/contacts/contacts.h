@@ -3,171 +3,186 @@
 #include "builtin.h"
 #include "contacts/near64.h"
 
-template <class ModelPool, class StatePool, class PairPose, class Contacts>
-wp::int32 simd_contacts(ModelPool models, StatePool states, PairPose pose, wp::mat_t<3, 3, wp::float64> rotation,
-                        wp::vec_t<3, wp::float64> position, bool proven, wp::vec_t<3, wp::int32> span,
-                        wp::array_t<wp::vec_t<3, wp::int32>> faces, wp::array_t<wp::int32> place, Contacts contacts) {
-    wp::int32 result = 0;
-#if defined(__CUDA_ARCH__)
-    __trap();  // a lane finds a contact
-#else
-    {
-#pragma clang fp contract(off)
-#include "contacts/near64.h"
-        typedef Contact64 C;
-        typedef Float64 F;
-        typedef F::bits bits;
-        typedef F::lanes lanes;
-        typedef F::Point Point;
-        const double* vertices = (const double*)models.vertex_pos.data;
-        const wp::vec_t<4, wp::int32>* corners = states.face_corner.data;
-        const bool with_gap = contacts.separation.shape[0] != 0, back = pose.swapped != 0;
-        wp::vec_t<3, wp::float64>* target[5] = {contacts.p0.data, contacts.p1.data, contacts.normal_a.data,
-                                                contacts.normal_b.data, contacts.normal.data};
-        // Corners of so many face pairs, in A's frame.
-        auto load = [&](const int* hit, int count, Point(&a)[3], Point(&b)[3]) {
-            int start[6][8];
-            for (int k = 0; k < 8; ++k) {
-                const wp::vec_t<3, wp::int32>& pair = faces.data[hit[k < count ? k : 0]];
-                const wp::vec_t<4, wp::int32>& a = corners[pose.corner_a + pair[back ? 2 : 1]];
-                const wp::vec_t<4, wp::int32>& b = corners[pose.corner_b + pair[back ? 1 : 2]];
-                for (int i = 0; i < 3; ++i) {
-                    start[i][k] = 4 * a[i];
-                    start[3 + i][k] = 4 * b[i];
-                }
-            }
+// Finds contacts of up to 8 face pairs at a time.
+template <class PairPose, class Contacts>
+struct ContactFinder {
+    typedef Contact64 C;
+    typedef Float64 F;
+    typedef F::bits bits;
+    typedef F::lanes lanes;
+    typedef F::Point Point;
+    const PairPose& pose;
+    const Contacts& contacts;
+    const wp::mat_t<3, 3, wp::float64>& rotation;
+    const wp::vec_t<3, wp::float64>& position;
+    const wp::vec_t<3, wp::int32>* faces;
+    const double* vertices;
+    const wp::vec_t<4, wp::int32>* corners;
+    bool proven, with_gap, back;
+    wp::vec_t<3, wp::float64>* target[5];
+
+    // Corners of so many face pairs, in A's frame.
+    void load(const int* hit, int count, Point (&a)[3], Point (&b)[3]) const {
+        int start[6][8];
+        for (int k = 0; k < 8; ++k) {
+            const wp::vec_t<3, wp::int32>& pair = faces[hit[k < count ? k : 0]];
+            const wp::vec_t<4, wp::int32>& a = corners[pose.corner_a + pair[back ? 2 : 1]];
+            const wp::vec_t<4, wp::int32>& b = corners[pose.corner_b + pair[back ? 1 : 2]];
             for (int i = 0; i < 3; ++i) {
-                a[i] = F::gather(vertices, start[i]);
-                b[i] = C::pose(pose.rotation.data, pose.translation, F::gather(vertices, start[3 + i]));
-            }
-        };
-        auto store = [&](const int* hit, int count, const Point(&found)[5]) {
-            if (count == 8 && hit[7] - hit[0] == 7) {
-                for (int i = 0; i < 5; ++i)
-                    C::store((double*)(target[i] + hit[0]), found[i]);
-            } else {
-                for (int i = 0; i < 5; ++i) {
-                    double numbers[24];
-                    C::store(numbers, found[i]);
-                    for (int k = 0; k < count; ++k)
-                        for (int c = 0; c < 3; ++c)
-                            target[i][hit[k]][c] = numbers[3 * k + c];
-                }
-            }
-            for (int k = 0; k < count; ++k)
-                contacts.coplanar.data[hit[k]] = 0;
-        };
-        // Those of faces that are apart; what it is not sure of keeps its mark.
-        auto find_near = [&](const int* hit, int count) {
-            Point a[3], b[3], of_b[3];
-            load(hit, count, a, b);
-            for (int i = 0; i < 3; ++i)
-                of_b[i] = F::minus(b[i], a[0]);
-            const Depth64::Scaled t = Depth64::scale(a, of_b);
-            Near64 near;
-            near.search(t);
-            bits open = near.square <= CLOSEST;
-            const Point own_a = C::filter_normal(false, a[0], a[1], a[2], open);
-            const Point own_b = C::filter_normal(false, b[0], b[1], b[2], open);
-            const Point end_a = C::pose(rotation.data, position, Near64::sum(near.of_a, a));
-            const Point end_b = C::pose(rotation.data, position, Near64::sum(near.of_b, b));
-            const Point normal_a = C::unit_vector(C::turn(rotation.data, own_a));
-            const Point normal_b = C::unit_vector(C::turn(rotation.data, own_b));
-            const Point normal = C::unit_vector(C::turn(rotation.data, near.find_way(t)));
-            store(hit, count,
-                  {back ? end_b : end_a, back ? end_a : end_b, back ? normal_b : normal_a, back ? normal_a : normal_b,
-                   back ? C::negate(normal) : normal});
-            const lanes separation = open ? lanes{} : C::root(near.square) * t.size;
-            for (int k = 0; k < count; ++k)
-                contacts.separation.data[hit[k]] = separation[k] > LEAST_SEPARATION ? separation[k] : LEAST_SEPARATION;
-        };
-        // So many face pairs; returns those that it is not sure of, a bit each.
-        auto find = [&](bool extends, const int* hit, int count) {
-            Point a[3], b[3], d[3][3];
-            load(hit, count, a, b);
-            // From each corner of A to each of B: the other way round, every rounding is the same.
-            for (int i = 0; i < 3; ++i)
-                for (int j = 0; j < 3; ++j)
-                    d[i][j] = F::minus(b[j], a[i]);
-            if (with_gap && !extends) {
-                const lanes depth = Depth64::measure(Depth64::scale(a, d[0]));
-                for (int k = 0; k < count; ++k)
-                    contacts.separation.data[hit[k]] = -(depth[k] < LEAST_SEPARATION ? LEAST_SEPARATION : depth[k]);
-            }
-            bits open = {};
-            const Point own_a = C::filter_normal(extends, a[0], a[1], a[2], open);
-            const Point own_b = C::filter_normal(extends, b[0], b[1], b[2], open);
-            lanes u[3], v[3];
-            bits up_a[3], up_b[3];
-            for (int i = 0; i < 3; ++i) {
-                u[i] = C::filter_volume(extends, b, a[i], d[i][0], d[i][1], d[i][2], open);
-                v[i] = C::filter_volume(extends, a, b[i], C::negate(d[0][i]), C::negate(d[1][i]), C::negate(d[2][i]),
-                                        open);
-                up_a[i] = u[i] > 0.0;
-                up_b[i] = v[i] > 0.0;
-                open |= (u[i] == 0.0) | (v[i] == 0.0);
-            }
-            // All corners of either on one side: as a coarser precision can report them.
-            open |= ~(up_a[0] ^ up_a[1]) & ~(up_a[1] ^ up_a[2]);
-            open |= ~(up_b[0] ^ up_b[1]) & ~(up_b[1] ^ up_b[2]);
-            // As `rotate_triangles` where no corner touches: p the lone corner, then q and r.
-            const bits first_a = (up_a[0] ^ up_a[1]) & ~(up_a[1] ^ up_a[2]);
-            const bits second_a = (up_a[0] ^ up_a[1]) & (up_a[1] ^ up_a[2]);
-            const bits first_b = (up_b[0] ^ up_b[1]) & ~(up_b[1] ^ up_b[2]);
-            const bits second_b = (up_b[0] ^ up_b[1]) & (up_b[1] ^ up_b[2]);
-            const bits below_a = ~(first_a ? up_a[0] : second_a ? up_a[1] : up_a[2]);
-            const bits below_b = ~(first_b ? up_b[0] : second_b ? up_b[1] : up_b[2]);
-            Point pa, qa, ra, pb, qb, rb;
-            lanes up, uq, ur, vp, vq, vr;
-            C::rotate(first_a, second_a, below_b, a, u, pa, qa, ra, up, uq, ur);
-            C::rotate(first_b, second_b, below_a, b, v, pb, qb, rb, vp, vq, vr);
-            // Of X(q), X(r) on A's edges against Y(q), Y(r) on B's; that the other two are in order is why faces meet.
-            const bits qr = C::order_ends(pa, qa, pb, rb, open).after, rq = C::order_ends(pa, ra, pb, qb, open).after;
-            if (!proven) {
-                open |= C::order_ends(pa, qa, pb, qb, open).after;
-                open |= C::order_ends(pa, ra, pb, rb, open).before;
-            }
-            Point p0 = C::cross_edge(F::choose(qr, pa, pb), F::choose(qr, qa, rb), qr ? up : vp, qr ? uq : vr);
-            Point p1 = C::cross_edge(F::choose(rq, pb, pa), F::choose(rq, qb, ra), rq ? vp : up, rq ? vq : ur);
-            p0 = C::pose(rotation.data, position, p0);
-            p1 = C::pose(rotation.data, position, p1);
-            const Point normal_a = C::unit_vector(C::turn(rotation.data, own_a));
-            const Point normal_b = C::unit_vector(C::turn(rotation.data, own_b));
-            const Point normal = C::blend_normals(normal_a, normal_b);
-            // Segments run the other way for one of two orders of the lone corners' sides, and of the objects.
-            const bits turned = (below_a ^ below_b) ^ (bits{} - (wp::int64)back);
-            store(hit, count,
-                  {F::choose(turned, p1, p0), F::choose(turned, p0, p1), back ? normal_b : normal_a,
-                   back ? normal_a : normal_b, back ? C::negate(normal) : normal});
-            return F::to_mask(open) & ((1u << count) - 1);
-        };
-        // First without double words, then with them those that need them, side by side: on the list, which they leave.
-        int* list = place.data + span[2];
-        int from = span[0], count = 0, apart = 0, left = 0, hit[8], near[8];
-        for (; from < span[1]; ++from) {
-            if (!with_gap || contacts.separation.data[from] < 0.0)
-                hit[count++] = from;
-            else
-                near[apart++] = from;
-            if (apart == 8 || (apart > 0 && from + 1 == span[1])) {
-                find_near(near, apart);
-                apart = 0;
-            }
-            if (count == 8 || (count > 0 && from + 1 == span[1])) {
-                for (unsigned int open = find(false, hit, count); open != 0; open &= open - 1)
-                    list[left++] = hit[__builtin_ctz(open)];
-                count = 0;
+                start[i][k] = 4 * a[i];
+                start[3 + i][k] = 4 * b[i];
             }
         }
-        result = span[2];
-        for (int i = 0; i < left; i += 8) {
-            count = left - i < 8 ? left - i : 8;
-            for (int k = 0; k < count; ++k)
-                hit[k] = list[i + k];
-            for (unsigned int open = find(true, hit, count); open != 0; open &= open - 1)
-                place.data[result++] = hit[__builtin_ctz(open)];
+        for (int i = 0; i < 3; ++i) {
+            a[i] = F::gather(vertices, start[i]);
+            b[i] = C::pose(pose.rotation.data, pose.translation, F::gather(vertices, start[3 + i]));
         }
     }
-#endif
+    void store(const int* hit, int count, const Point (&found)[5]) const {
+        if (count == 8 && hit[7] - hit[0] == 7) {
+            for (int i = 0; i < 5; ++i)
+                C::store((double*)(target[i] + hit[0]), found[i]);
+        } else {
+            for (int i = 0; i < 5; ++i) {
+                double numbers[24];
+                C::store(numbers, found[i]);
+                for (int k = 0; k < count; ++k)
+                    for (int c = 0; c < 3; ++c)
+                        target[i][hit[k]][c] = numbers[3 * k + c];
+            }
+        }
+        for (int k = 0; k < count; ++k)
+            contacts.coplanar.data[hit[k]] = 0;
+    }
+    // Those of faces that are apart; what it is not sure of keeps its mark.
+    void find_near(const int* hit, int count) const {
+        Point a[3], b[3], of_b[3];
+        load(hit, count, a, b);
+        for (int i = 0; i < 3; ++i)
+            of_b[i] = F::minus(b[i], a[0]);
+        const Depth64::Scaled t = Depth64::scale(a, of_b);
+        Near64 near;
+        near.search(t);
+        bits open = near.square <= CLOSEST;
+        const Point own_a = C::filter_normal(false, a[0], a[1], a[2], open);
+        const Point own_b = C::filter_normal(false, b[0], b[1], b[2], open);
+        const Point end_a = C::pose(rotation.data, position, Near64::sum(near.of_a, a));
+        const Point end_b = C::pose(rotation.data, position, Near64::sum(near.of_b, b));
+        const Point normal_a = C::unit_vector(C::turn(rotation.data, own_a));
+        const Point normal_b = C::unit_vector(C::turn(rotation.data, own_b));
+        const Point normal = C::unit_vector(C::turn(rotation.data, near.find_way(t)));
+        store(hit, count,
+              {back ? end_b : end_a, back ? end_a : end_b, back ? normal_b : normal_a, back ? normal_a : normal_b,
+               back ? C::negate(normal) : normal});
+        const lanes separation = open ? lanes{} : C::root(near.square) * t.size;
+        for (int k = 0; k < count; ++k)
+            contacts.separation.data[hit[k]] = separation[k] > LEAST_SEPARATION ? separation[k] : LEAST_SEPARATION;
+    }
+    // So many face pairs; returns those that it is not sure of, a bit each.
+    unsigned int find(bool extends, const int* hit, int count) const {
+        Point a[3], b[3], d[3][3];
+        load(hit, count, a, b);
+        // From each corner of A to each of B: the other way round, every rounding is the same.
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j)
+                d[i][j] = F::minus(b[j], a[i]);
+        if (with_gap && !extends) {
+            const lanes depth = Depth64::measure(Depth64::scale(a, d[0]));
+            for (int k = 0; k < count; ++k)
+                contacts.separation.data[hit[k]] = -(depth[k] < LEAST_SEPARATION ? LEAST_SEPARATION : depth[k]);
+        }
+        bits open = {};
+        const Point own_a = C::filter_normal(extends, a[0], a[1], a[2], open);
+        const Point own_b = C::filter_normal(extends, b[0], b[1], b[2], open);
+        lanes u[3], v[3];
+        bits up_a[3], up_b[3];
+        for (int i = 0; i < 3; ++i) {
+            u[i] = C::filter_volume(extends, b, a[i], d[i][0], d[i][1], d[i][2], open);
+            v[i] = C::filter_volume(extends, a, b[i], C::negate(d[0][i]), C::negate(d[1][i]), C::negate(d[2][i]), open);
+            up_a[i] = u[i] > 0.0;
+            up_b[i] = v[i] > 0.0;
+            open |= (u[i] == 0.0) | (v[i] == 0.0);
+        }
+        // All corners of either on one side: as a coarser precision can report them.
+        open |= ~(up_a[0] ^ up_a[1]) & ~(up_a[1] ^ up_a[2]);
+        open |= ~(up_b[0] ^ up_b[1]) & ~(up_b[1] ^ up_b[2]);
+        // As `rotate_triangles` where no corner touches: p the lone corner, then q and r.
+        const bits first_a = (up_a[0] ^ up_a[1]) & ~(up_a[1] ^ up_a[2]);
+        const bits second_a = (up_a[0] ^ up_a[1]) & (up_a[1] ^ up_a[2]);
+        const bits first_b = (up_b[0] ^ up_b[1]) & ~(up_b[1] ^ up_b[2]);
+        const bits second_b = (up_b[0] ^ up_b[1]) & (up_b[1] ^ up_b[2]);
+        const bits below_a = ~(first_a ? up_a[0] : second_a ? up_a[1] : up_a[2]);
+        const bits below_b = ~(first_b ? up_b[0] : second_b ? up_b[1] : up_b[2]);
+        Point pa, qa, ra, pb, qb, rb;
+        lanes up, uq, ur, vp, vq, vr;
+        C::rotate(first_a, second_a, below_b, a, u, pa, qa, ra, up, uq, ur);
+        C::rotate(first_b, second_b, below_a, b, v, pb, qb, rb, vp, vq, vr);
+        // Of X(q), X(r) on A's edges against Y(q), Y(r) on B's; that the other two are in order is why faces meet.
+        const bits qr = C::order_ends(pa, qa, pb, rb, open).after, rq = C::order_ends(pa, ra, pb, qb, open).after;
+        if (!proven) {
+            open |= C::order_ends(pa, qa, pb, qb, open).after;
+            open |= C::order_ends(pa, ra, pb, rb, open).before;
+        }
+        Point p0 = C::cross_edge(F::choose(qr, pa, pb), F::choose(qr, qa, rb), qr ? up : vp, qr ? uq : vr);
+        Point p1 = C::cross_edge(F::choose(rq, pb, pa), F::choose(rq, qb, ra), rq ? vp : up, rq ? vq : ur);
+        p0 = C::pose(rotation.data, position, p0);
+        p1 = C::pose(rotation.data, position, p1);
+        const Point normal_a = C::unit_vector(C::turn(rotation.data, own_a));
+        const Point normal_b = C::unit_vector(C::turn(rotation.data, own_b));
+        const Point normal = C::blend_normals(normal_a, normal_b);
+        // Segments run the other way for one of two orders of the lone corners' sides, and of the objects.
+        const bits turned = (below_a ^ below_b) ^ (bits{} - (wp::int64)back);
+        store(hit, count,
+              {F::choose(turned, p1, p0), F::choose(turned, p0, p1), back ? normal_b : normal_a,
+               back ? normal_a : normal_b, back ? C::negate(normal) : normal});
+        return F::to_mask(open) & ((1u << count) - 1);
+    }
+};
+
+template <class ModelPool, class StatePool, class PairPose, class Contacts>
+wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const PairPose& pose,
+                        wp::mat_t<3, 3, wp::float64> rotation, wp::vec_t<3, wp::float64> position, bool proven,
+                        wp::vec_t<3, wp::int32> span, wp::array_t<wp::vec_t<3, wp::int32>> faces,
+                        wp::array_t<wp::int32> place, const Contacts& contacts) {
+#pragma clang fp contract(off)
+    const bool with_gap = contacts.separation.shape[0] != 0;
+    const ContactFinder<PairPose, Contacts> finder = {
+        pose,
+        contacts,
+        rotation,
+        position,
+        faces.data,
+        (const double*)models.vertex_pos.data,
+        states.face_corner.data,
+        proven,
+        with_gap,
+        pose.swapped != 0,
+        {contacts.p0.data, contacts.p1.data, contacts.normal_a.data, contacts.normal_b.data, contacts.normal.data}};
+    // First without double words, then with them those that need them, side by side: on the list, which they leave.
+    int* list = place.data + span[2];
+    int from = span[0], count = 0, apart = 0, left = 0, hit[8], near[8];
+    for (; from < span[1]; ++from) {
+        if (!with_gap || contacts.separation.data[from] < 0.0)
+            hit[count++] = from;
+        else
+            near[apart++] = from;
+        if (apart == 8 || (apart > 0 && from + 1 == span[1])) {
+            finder.find_near(near, apart);
+            apart = 0;
+        }
+        if (count == 8 || (count > 0 && from + 1 == span[1])) {
+            for (unsigned int open = finder.find(false, hit, count); open != 0; open &= open - 1)
+                list[left++] = hit[__builtin_ctz(open)];
+            count = 0;
+        }
+    }
+    wp::int32 result = span[2];
+    for (int i = 0; i < left; i += 8) {
+        count = left - i < 8 ? left - i : 8;
+        for (int k = 0; k < count; ++k)
+            hit[k] = list[i + k];
+        for (unsigned int open = finder.find(true, hit, count); open != 0; open &= open - 1)
+            place.data[result++] = hit[__builtin_ctz(open)];
+    }
     return result;
 }

@@ -4,8 +4,7 @@
 #include "distance/faces32.h"
 
 template <class Corners>
-inline CUDA_CALLABLE wp::vec_t<2, wp::float32> bound_faces(wp::float32 own, Corners a, Corners b) {
-#include "distance/faces32.h"
+CUDA_CALLABLE wp::vec_t<2, wp::float32> bound_faces(wp::float32 own, const Corners& a, const Corners& b) {
     typedef NearestFaces N;
     N::Corners c;
     const N::lanes zero = {};

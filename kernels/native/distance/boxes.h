@@ -2,6 +2,7 @@
 #pragma once
 #include "builtin.h"
 #include "distance/slab_bounds.h"
+#include "search/siblings.h"
 
 struct NearBoxes : SlabBounds {
     // Lanes are two siblings of one tree as they lie in memory; or a number each of A's eight nodes, then of B's.
@@ -50,12 +51,9 @@ struct NearBoxes : SlabBounds {
         return s;
     }
     Taken take(wp::int64 item) const {
-        // As in `descend`: an item loads two siblings of either tree, and names those of the four pairs in use.
-        constexpr unsigned long long PAIRS_USED = 0xfcfca854f3f3a251;
         const unsigned int x = (unsigned int)(item >> 32), y = (unsigned int)item;
-        const unsigned long long turned = ((unsigned long long)item << 1) | ((unsigned long long)item >> 63);
         const Taken taken = {tree_a + 32 * (wp::int64)(x & 0x7ffffffe), tree_b + 32 * (wp::int64)(y & 0x7ffffffe),
-                             (unsigned int)(PAIRS_USED >> (((turned & 3) << 2) | ((turned >> 28) & 48))) & 15};
+                             pairs_in_use(item)};
         __builtin_prefetch(taken.a);
         __builtin_prefetch(taken.b);
         __builtin_prefetch(taken.a + slabs);

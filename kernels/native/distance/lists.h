@@ -3,9 +3,8 @@
 #include "builtin.h"
 #include "distance/memory.h"
 
-void open_search(wp::float32 upper, bool found, bool diving, wp::int64 first, wp::int32 thread,
-                 wp::array_t<wp::float32> memory) {
-#include "distance/memory.h"
+inline void open_search(wp::float32 upper, bool found, bool diving, wp::int64 first, wp::int32 thread,
+                        wp::array_t<wp::float32> memory) {
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
     h = NearestMemory::Header{};
@@ -17,8 +16,7 @@ void open_search(wp::float32 upper, bool found, bool diving, wp::int64 first, wp
     m.bound[0] = 0.0f;
 }
 
-wp::int64 take_nearest(wp::float32 upper, wp::int32 thread, wp::array_t<wp::float32> memory) {
-#include "distance/memory.h"
+inline wp::int64 take_nearest(wp::float32 upper, wp::int32 thread, wp::array_t<wp::float32> memory) {
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
     h.upper = upper < h.upper ? upper : h.upper;

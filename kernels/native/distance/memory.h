@@ -38,4 +38,42 @@ struct NearestMemory {
         const float off = more - terms[3] * upper;
         return off > 0.0f ? upper - off : upper;
     }
+    // Drop faces for float64 that are too far by now.
+    void keep_open() const {
+        int kept = 0;
+        for (int i = 0; i < header->open_count; ++i)
+            if (open_bound[i] <= header->upper) {
+                open[kept] = open[i];
+                open_bound[kept++] = open_bound[i];
+            }
+        header->open_count = kept;
+    }
+    // Of the entries of the stack from one on, the nearest comes last, so that it is taken first.
+    void put_nearest_last(int first, int end) const {
+        for (int k = first; k < end - 1; ++k)
+            if (bound[k] < bound[end - 1]) {
+                const wp::int64 other = item[k];
+                const float other_bound = bound[k];
+                item[k] = item[end - 1];
+                bound[k] = bound[end - 1];
+                item[end - 1] = other;
+                bound[end - 1] = other_bound;
+            }
+    }
+    // What waited for later, of which much is too far by now; on the stack as much as leaves it room.
+    void take_later(float soon, float limit, int& top, int& count) const {
+        int kept = 0;
+        for (int i = 0; i < count; ++i) {
+            const float here = later_bound[i];
+            const wp::int64 pair = later[i];
+            if (here <= soon && top < CPU_STACK_LENGTH / 2) {
+                item[top] = pair;
+                bound[top++] = here;
+            } else if (here <= limit) {
+                later[kept] = pair;
+                later_bound[kept++] = here;
+            }
+        }
+        count = kept;
+    }
 };

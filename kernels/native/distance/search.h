@@ -5,19 +5,58 @@
 #include "distance/corners32.h"
 #include "distance/memory.h"
 
-template <class ModelPool, class StatePool, class PairPose, class SearchScale, class Slabs>
-wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairPose pose, SearchScale scaling,
-                                       wp::vec_t<4, wp::float32> terms, Slabs slabs, bool with_slabs, wp::int32 thread,
-                                       wp::array_t<wp::float32> memory) {
-#if defined(__CUDA_ARCH__)
-    __trap();  // warps have a search of their own
-    return wp::vec_t<3, wp::int32>();
-#else
-#include "distance/boxes.h"
-#include "distance/corners32.h"
-#include "distance/memory.h"
+// Bounds over `limit` are dropped; those over `soon` wait for later, when a nearer pair may have been found.
+struct NearestLimits {
+    float limit, soon;
+
+    template <class SearchScale>
+    void set(const NearestMemory::Header& h, const wp::vec_t<4, wp::float32>& terms, const SearchScale& scaling) {
+        constexpr float PART[] = {0.6f, 0.85f, 1.0f};
+        const float cut = h.found ? NearestMemory::cut_of(h.upper, terms) : h.upper;
+        auto to_bound = [&](float x) {
+            const float y = 2.0f * (x * scaling.grow + scaling.least);
+            return x < 0.0f ? -1.0f : y * y;
+        };
+        limit = to_bound(cut);
+        soon = h.level < 2 && !h.diving ? to_bound(PART[h.level] * cut) : limit;
+    }
+};
+
+// Measure up to 16 pairs of faces in float32: those that may be nearest wait for float64.
+template <class ModelPool, class StatePool, class PairPose, class SearchScale>
+void measure_faces(const ModelPool& models, const StatePool& states, const PairPose& pose, const SearchScale& scaling,
+                   const wp::vec_t<4, wp::float32>& terms, const NearestMemory& m, const wp::int64* items, int count,
+                   NearestLimits& limits) {
     typedef NearestFaces N;
     typedef N::F F;
+    NearestMemory::Header& h = *m.header;
+    const N::Corners corners =
+        NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a, pose.corner_b,
+                             pose.rotation32.data, scaling.translation, scaling.scale, items, count);
+    F::lanes size;
+    const F::lanes d = __builtin_elementwise_sqrt(N::measure(corners, size));
+    const F::lanes error = N::error_of(d, size, scaling.error), over = d + error, under = d - error;
+    float low[16];
+    h.diving = 0;
+    for (int i = 0; i < count; ++i)
+        if (over[i] < h.upper) {
+            h.upper = over[i];
+            h.found = 1;
+        }
+    __builtin_memcpy(low, &under, sizeof(low));
+    limits.set(h, terms, scaling);
+    for (int i = 0; i < count; ++i)
+        if (low[i] <= h.upper) {
+            m.open[h.open_count] = items[i];
+            m.open_bound[h.open_count++] = low[i];
+        }
+    h.face_tests += count;
+}
+
+template <class ModelPool, class StatePool, class PairPose, class SearchScale, class Slabs>
+wp::vec_t<3, wp::int32> search_nearest(const ModelPool& models, const StatePool& states, const PairPose& pose,
+                                       const SearchScale& scaling, wp::vec_t<4, wp::float32> terms, const Slabs& slabs,
+                                       bool with_slabs, wp::int32 thread, wp::array_t<wp::float32> memory) {
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
     const auto& r = pose.rotation32.data;
@@ -30,54 +69,8 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     }
     // Apart from the memory that lists are written to.
     int top = h.top, later = h.later, waiting = h.waiting, node_tests = h.node_tests;
-    // Bounds over `limit` are dropped; those over `soon` wait for later, when a nearer pair may have been found.
-    float cut = 0.0f, limit = 0.0f, soon = 0.0f;
-    auto set_limits = [&]() {
-        constexpr float PART[] = {0.6f, 0.85f, 1.0f};
-        cut = h.found ? NearestMemory::cut_of(h.upper, terms) : h.upper;
-        auto to_bound = [&](float x) {
-            const float y = 2.0f * (x * scaling.grow + scaling.least);
-            return x < 0.0f ? -1.0f : y * y;
-        };
-        limit = to_bound(cut);
-        soon = h.level < 2 && !h.diving ? to_bound(PART[h.level] * cut) : limit;
-    };
-    auto measure = [&](int count) {
-        waiting -= count;
-        wp::int64* items = m.face + waiting;
-        const N::Corners corners =
-            NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a, pose.corner_b, r,
-                                 scaling.translation, scaling.scale, items, count);
-        F::lanes size;
-        const F::lanes d = __builtin_elementwise_sqrt(N::measure(corners, size));
-        const F::lanes error = N::error_of(d, size, scaling.error), over = d + error, under = d - error;
-        float low[16];
-        h.diving = 0;
-        for (int i = 0; i < count; ++i)
-            if (over[i] < h.upper) {
-                h.upper = over[i];
-                h.found = 1;
-            }
-        __builtin_memcpy(low, &under, sizeof(low));
-        set_limits();
-        for (int i = 0; i < count; ++i)
-            if (low[i] <= h.upper) {
-                m.open[h.open_count] = items[i];
-                m.open_bound[h.open_count++] = low[i];
-            }
-        h.face_tests += count;
-        boxes.normals = h.face_tests >= NORMALS_LEAST;
-    };
-    auto keep_open = [&]() {
-        int kept = 0;
-        for (int i = 0; i < h.open_count; ++i)
-            if (m.open_bound[i] <= h.upper) {
-                m.open[kept] = m.open[i];
-                m.open_bound[kept++] = m.open_bound[i];
-            }
-        h.open_count = kept;
-    };
-    set_limits();
+    NearestLimits limits;
+    limits.set(h, terms, scaling);
     while (h.open_count <= OPEN_LENGTH - 16) {
         while (top > 0 && waiting < 16) {
             const int room = (CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH - 16 - top) / 3, fits = room > 1 ? room : 1;
@@ -86,7 +79,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
             int count = 0;
             while (top > 0 && count < wanted) {
                 --top;
-                if (m.bound[top] <= limit) {
+                if (m.bound[top] <= limits.limit) {
                     taken[count >> 2][count & 3] = boxes.take(m.item[top]);
                     ++count;
                 }
@@ -95,11 +88,11 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
                 taken[i >> 2][i & 3] = taken[0][0];
                 taken[i >> 2][i & 3].used = 0;
             }
-            const float now = later <= LATER_LENGTH - 4 * NEAREST_AT_ONCE - 16 ? soon : limit;
+            const float now = later <= LATER_LENGTH - 4 * NEAREST_AT_ONCE - 16 ? limits.soon : limits.limit;
             for (int i = 0; 4 * i < count; ++i) {
                 const NearBoxes::Tested tested = boxes.test(taken[i]);
                 node_tests += __builtin_popcount(tested.used);
-                const unsigned int near = tested.used & NearBoxes::to_mask(tested.bound <= limit);
+                const unsigned int near = tested.used & NearBoxes::to_mask(tested.bound <= limits.limit);
                 const unsigned int nodes = near & ~tested.leaves,
                                    first = nodes & NearBoxes::to_mask(tested.bound <= now);
                 NearBoxes::append_items(m.item + top, tested, first);
@@ -110,44 +103,26 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
                 const int end = top + __builtin_popcount(first);
                 later += __builtin_popcount(nodes & ~first);
                 waiting += __builtin_popcount(near & tested.leaves);
-                // The nearest comes last, so that it is taken first.
-                for (int k = top; h.diving && k < end - 1; ++k)
-                    if (m.bound[k] < m.bound[end - 1]) {
-                        const wp::int64 item = m.item[k];
-                        const float bound = m.bound[k];
-                        m.item[k] = m.item[end - 1];
-                        m.bound[k] = m.bound[end - 1];
-                        m.item[end - 1] = item;
-                        m.bound[end - 1] = bound;
-                    }
+                if (h.diving)
+                    m.put_nearest_last(top, end);
                 top = end;
             }
             if (h.diving && waiting > 0)
                 break;
         }
         if (waiting > 0) {
-            measure(waiting < 16 ? waiting : 16);
+            const int count = waiting < 16 ? waiting : 16;
+            waiting -= count;
+            measure_faces(models, states, pose, scaling, terms, m, m.face + waiting, count, limits);
+            boxes.normals = h.face_tests >= NORMALS_LEAST;
             if (h.open_count > OPEN_LENGTH - 16)
-                keep_open();
+                m.keep_open();
         } else if (later > 0) {
-            // What waited for later, of which much is too far by now; on the stack as much as leaves it room.
             h.level = h.level < 2 ? h.level + 1 : 2;
-            set_limits();
-            int kept = 0;
-            for (int i = 0; i < later; ++i) {
-                const float bound = m.later_bound[i];
-                const wp::int64 item = m.later[i];
-                if (bound <= soon && top < CPU_STACK_LENGTH / 2) {
-                    m.item[top] = item;
-                    m.bound[top++] = bound;
-                } else if (bound <= limit) {
-                    m.later[kept] = item;
-                    m.later_bound[kept++] = bound;
-                }
-            }
-            later = kept;
+            limits.set(h, terms, scaling);
+            m.take_later(limits.soon, limits.limit, top, later);
         } else if (top == 0) {
-            keep_open();
+            m.keep_open();
             return wp::vec_t<3, wp::int32>(1, node_tests, h.face_tests);
         }
     }
@@ -156,5 +131,4 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     h.waiting = waiting;
     h.node_tests = node_tests;
     return wp::vec_t<3, wp::int32>(0, node_tests, h.face_tests);
-#endif
 }

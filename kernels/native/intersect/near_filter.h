@@ -4,13 +4,8 @@
 #include "distance/corners32.h"
 
 template <class ModelPool, class StatePool, class PairPose>
-wp::int32 simd_near_filter(ModelPool models, StatePool states, PairPose pose, wp::int32 waiting,
+wp::int32 simd_near_filter(const ModelPool& models, const StatePool& states, const PairPose& pose, wp::int32 waiting,
                            wp::array_t<wp::int64> faces) {
-#if defined(__CUDA_ARCH__)
-    __trap();  // a lane measures a pair
-    return 0;
-#else
-#include "distance/corners32.h"
     typedef NearestFaces N;
     typedef N::F F;
     wp::int64* list = faces.data;
@@ -37,5 +32,4 @@ wp::int32 simd_near_filter(ModelPool models, StatePool states, PairPose pose, wp
         }
     }
     return kept;
-#endif
 }

@@ -5,12 +5,8 @@
 #include "intersect/slabs.h"
 
 template <class ModelPool, class StatePool, class PairPose>
-wp::int64 slab_cost(ModelPool models, StatePool states, PairPose pose, wp::int32 repeats) {
+wp::int64 slab_cost(const ModelPool& models, const StatePool& states, const PairPose& pose, wp::int32 repeats) {
     wp::int64 cost = 0;
-#if defined(__CUDA_ARCH__)
-    __trap();  // warps have a traversal of their own
-#else
-#include "intersect/slabs.h"
     // About how many faces an object has at its LOD: each vertex split adds as many as any other.
     auto faces_of = [&](int place) {
         const Slabs::Content x = Slabs::content_of(states.node_start.data, states.model.data, states.lod.data, place);
@@ -21,18 +17,13 @@ wp::int64 slab_cost(ModelPool models, StatePool states, PairPose pose, wp::int32
     cost = faces_b < 16384 ? faces_b : faces_b * (faces_b >> 14);
     if (repeats < 2)
         cost += faces_a / 2;
-#endif
     return cost;
 }
 
 template <class ModelPool, class StatePool, class PairPose>
-wp::vec_t<2, wp::int32> open_subtrees(ModelPool models, StatePool states, PairPose pose, wp::int32 thread,
-                                      wp::array_t<wp::float32> memory) {
+wp::vec_t<2, wp::int32> open_subtrees(const ModelPool& models, const StatePool& states, const PairPose& pose,
+                                      wp::int32 thread, wp::array_t<wp::float32> memory) {
     wp::vec_t<2, wp::int32> floors;
-#if defined(__CUDA_ARCH__)
-    __trap();  // warps have a traversal of their own
-#else
-#include "intersect/slab_axes.h"
     const Slabs::Memory kept = Slabs::find_memory(memory.data, memory.shape[1], thread);
     const Slabs::Box* nodes = (const Slabs::Box*)states.node_box.data;
     const Slabs::Content a = Slabs::content_of(states.node_start.data, states.model.data, states.lod.data, pose.node_a);
@@ -75,6 +66,5 @@ wp::vec_t<2, wp::int32> open_subtrees(ModelPool models, StatePool states, PairPo
     }
     kept.floors[0] = floors[0] = Slabs::find_floor(nodes + pose.node_a);
     kept.floors[1] = floors[1] = Slabs::find_floor(nodes + pose.node_b);
-#endif
     return floors;
 }

@@ -59,6 +59,23 @@ struct Slabs {
         int floor;   // level of the subtrees' roots
         int* roots;  // of the subtrees in the slots, 0 for none
         Record* records;
+
+        // The records of two siblings; null if their subtree takes the place of another one while items wait.
+        __attribute__((always_inline)) const Record* find(const void* near, unsigned int half, int slots,
+                                                          bool wait) const {
+            const unsigned int node = half & 0x7fffffff;
+            const int below = level_of(node) - floor;
+            const unsigned int root = node >> below;
+            const unsigned int slot = root & (slots - 1);
+            Record* subtree = records + (wp::int64)SUBTREE_RECORDS * slot;
+            if (__builtin_expect(roots[slot] != (int)root, 0)) {
+                if (roots[slot] != 0 && wait)
+                    return nullptr;
+                roots[slot] = (int)root;
+                fill(*this, near, root, subtree);
+            }
+            return subtree + (((1 << below) | (node & ((1 << below) - 1))) & ~1);
+        }
     };
     static int level_of(unsigned int node) { return 31 - __builtin_clz(node); }
     static int place_of(unsigned int node, int floor) {

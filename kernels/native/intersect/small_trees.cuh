@@ -1,54 +1,28 @@
 // Leaves of two small trees in a warp's shared memory, where its stack lies otherwise. On the CPU a warp is one thread.
 #pragma once
 #include "builtin.h"
+#include "base/shared.cuh"
 #include "base/sizes.h"
 
-inline CUDA_CALLABLE wp::int32 read_number(wp::uint64 items, wp::int32 i) {
-#if defined(__CUDA_ARCH__)
-    int x;
-    asm volatile("ld.shared.b32 %0, [%1];" : "=r"(x) : "r"((unsigned int)items + 4 * i) : "memory");
-    return x;
-#else
-    return ((const int*)items)[i];
-#endif
-}
+struct alignas(16) Quarter {
+    float x, y, z, w;
+};
+
+inline CUDA_CALLABLE wp::int32 read_number(wp::uint64 items, wp::int32 i) { return *entry<volatile int>(items, i); }
 
 inline CUDA_CALLABLE void write_number(wp::uint64 items, wp::int32 i, bool flag, wp::int32 x) {
-#if defined(__CUDA_ARCH__)
-    asm volatile("{ .reg .pred used; setp.ne.s32 used, %0, 0; @used st.shared.b32 [%1], %2; }" ::"r"((int)flag),
-                 "r"((unsigned int)items + 4 * i), "r"(x)
-                 : "memory");
-#else
     if (flag)
-        ((int*)items)[i] = x;
-#endif
+        *entry<volatile int>(items, i) = x;
 }
 
 inline CUDA_CALLABLE wp::vec_t<4, wp::float32> read_quarter(wp::uint64 items, wp::int32 i) {
-#if defined(__CUDA_ARCH__)
-    float x, y, z, w;
-    asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];"
-                 : "=f"(x), "=f"(y), "=f"(z), "=f"(w)
-                 : "r"((unsigned int)items + 16 * i)
-                 : "memory");
-    return wp::vec_t<4, wp::float32>(x, y, z, w);
-#else
-    const float* p = (const float*)items + 4 * i;
-    return wp::vec_t<4, wp::float32>(p[0], p[1], p[2], p[3]);
-#endif
+    const Quarter q = *entry<Quarter>(items, i);
+    return wp::vec_t<4, wp::float32>(q.x, q.y, q.z, q.w);
 }
 
 inline CUDA_CALLABLE void write_quarter(wp::uint64 items, wp::int32 i, bool flag, wp::vec_t<4, wp::float32> x) {
-#if defined(__CUDA_ARCH__)
-    asm volatile(
-        "{ .reg .pred used; setp.ne.s32 used, %0, 0; @used st.shared.v4.f32 [%1], {%2, %3, %4, %5}; }" ::"r"((int)flag),
-        "r"((unsigned int)items + 16 * i), "f"(x[0]), "f"(x[1]), "f"(x[2]), "f"(x[3])
-        : "memory");
-#else
-    float* p = (float*)items + 4 * i;
-    for (int k = 0; flag && k < 4; ++k)
-        p[k] = x[k];
-#endif
+    if (flag)
+        *entry<Quarter>(items, i) = Quarter{x[0], x[1], x[2], x[3]};
 }
 
 inline CUDA_CALLABLE bool spans_overlap(wp::vec_t<3, wp::float32> a, wp::vec_t<3, wp::float32> b,
@@ -57,25 +31,16 @@ inline CUDA_CALLABLE bool spans_overlap(wp::vec_t<3, wp::float32> a, wp::vec_t<3
 }
 
 inline CUDA_CALLABLE wp::int32 read_half(wp::uint64 items, wp::int32 i) {
-#if defined(__CUDA_ARCH__)
-    unsigned short x;
-    asm volatile("ld.shared.u16 %0, [%1];" : "=h"(x) : "r"((unsigned int)items + 2 * i) : "memory");
-    return x;
-#else
-    return ((const unsigned short*)items)[i];
-#endif
+    return *entry<volatile unsigned short>(items, i);
 }
 
 inline CUDA_CALLABLE void push_half(wp::uint64 items, wp::int32 end, bool flag, wp::int32 x) {
 #if defined(__CUDA_ARCH__)
     const unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    const unsigned int at = end + __popc(votes & ((1u << threadIdx.x) - 1u));
-    if (flag)
-        asm volatile("st.shared.u16 [%0], %1;" ::"r"((unsigned int)items + 2 * at), "h"((unsigned short)x) : "memory");
-#else
-    if (flag)
-        ((unsigned short*)items)[end] = x;
+    end += __popc(votes & ((1u << threadIdx.x) - 1u));
 #endif
+    if (flag)
+        *entry<volatile unsigned short>(items, end) = (unsigned short)x;
 }
 
 inline CUDA_CALLABLE wp::int32 reserve_run(wp::array_t<wp::int32> total, wp::int32 count) {
@@ -95,23 +60,19 @@ inline CUDA_CALLABLE wp::uint32 compare_boxes(wp::uint64 items, wp::int32 rows, 
                                               wp::vec_t<3, wp::float32> upper, wp::vec_t<3, wp::float32> posed_lower,
                                               wp::vec_t<3, wp::float32> posed_upper) {
     unsigned int bits = 0;
-#if defined(__CUDA_ARCH__)
-    const unsigned int first = items;
     // What lies behind the last row is read, too, and its bits are left out.
     for (int row = 0; row < rows; row += 2)
 #pragma unroll
         for (int k = 0; k < 2; ++k) {
             float x[12];
 #pragma unroll
-            for (int q = 0; q < 3; ++q)
-                asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];"
-                             : "=f"(x[4 * q]), "=f"(x[4 * q + 1]), "=f"(x[4 * q + 2]), "=f"(x[4 * q + 3])
-                             : "r"(first + 48 * (row + k) + 16 * q));
-#else
-    for (int row = 0; row < rows; ++row) {
-        const int k = 0;
-        const float* x = (const float*)items + 12 * row;
-#endif
+            for (int q = 0; q < 3; ++q) {
+                const Quarter part = *entry<Quarter>(items, 3 * (row + k) + q);
+                x[4 * q] = part.x;
+                x[4 * q + 1] = part.y;
+                x[4 * q + 2] = part.z;
+                x[4 * q + 3] = part.w;
+            }
             bool overlap = true;
             for (int i = 0; i < 3; ++i) {
                 overlap &= (x[i] <= posed_upper[i]) & (posed_lower[i] <= x[3 + i]);

@@ -2,12 +2,9 @@
 #pragma once
 #include "builtin.h"
 
-inline CUDA_CALLABLE void sort_by_pair(wp::int32 count, wp::int32 pair_mask, wp::int32 flag,
-                                       wp::array_t<wp::vec_t<3, wp::int32>> face, wp::array_t<wp::int64> key,
-                                       wp::array_t<wp::vec_t<3, wp::int32>> sorted, wp::array_t<wp::int32> start) {
-#if defined(__CUDA_ARCH__)
-    __trap();  // see `sort_hits`
-#else
+inline void sort_by_pair(wp::int32 count, wp::int32 pair_mask, wp::int32 flag,
+                         wp::array_t<wp::vec_t<3, wp::int32>> face, wp::array_t<wp::int64> key,
+                         wp::array_t<wp::vec_t<3, wp::int32>> sorted, wp::array_t<wp::int32> start) {
     typedef unsigned long long word;
     const int pairs = start.shape[0] - 1;
     // Faces and the pair's flag in one word, by pairs; `start` counts to where each ends meanwhile.
@@ -55,5 +52,4 @@ inline CUDA_CALLABLE void sort_by_pair(wp::int32 count, wp::int32 pair_mask, wp:
             sorted.data[first + i] = wp::vec_t<3, wp::int32>(p | (from[i] & 1 ? flag : 0), (wp::int32)(from[i] >> 32),
                                                              (wp::int32)((unsigned int)from[i] >> 1));
     }
-#endif
 }

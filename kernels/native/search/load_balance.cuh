@@ -4,13 +4,11 @@
 #include "base/sizes.h"
 
 inline CUDA_CALLABLE wp::int32 first_ended(bool descends, wp::array_t<wp::int32> counter) {
-#include "base/sizes.h"
     const int noted = *(const volatile int*)(counter.data + 4);
     return descends || noted != 0 ? 0 : -NO_UNIT;
 }
 
 inline CUDA_CALLABLE wp::int32 first_unit(wp::array_t<wp::int32> counter) {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     const int taken = *(const volatile int*)(counter.data + 3);
     return __shfl_sync(0xffffffffu, taken >= NO_UNIT ? NO_UNIT : (int)blockIdx.x, 0);
@@ -38,6 +36,14 @@ inline CUDA_CALLABLE wp::int32 claim_unit(wp::array_t<wp::int32> counter) {
 #endif
 }
 
+inline CUDA_CALLABLE wp::int32 take_thread(wp::array_t<wp::int32> counter) {
+#if defined(__CUDA_ARCH__)
+    return 0;
+#else
+    return __atomic_fetch_add(counter.data + 1, 1, __ATOMIC_RELAXED);
+#endif
+}
+
 inline CUDA_CALLABLE wp::int64 load_tickets(wp::array_t<wp::int32> counter) {
 #if defined(__CUDA_ARCH__)
     // One load of both, past the first-level cache.
@@ -60,7 +66,6 @@ inline CUDA_CALLABLE wp::int32 count_idle(wp::int64 tickets) {
 inline CUDA_CALLABLE wp::int32 await_donation(wp::array_t<wp::int32> counter, wp::array_t<wp::int32> flag,
                                               wp::int32 ended) {
 #if defined(__CUDA_ARCH__)
-#include "base/sizes.h"
     int slot = -1, left = 1;
     if (threadIdx.x == 0) {
         __threadfence();  // a slot that this warp has freed, before the last one fills it with -1
@@ -107,7 +112,6 @@ inline CUDA_CALLABLE void free_slot(wp::array_t<wp::int32> flag, wp::int32 slot)
 
 inline CUDA_CALLABLE wp::int32 claim_slot(wp::array_t<wp::int32> counter, wp::array_t<wp::int32> flag) {
 #if defined(__CUDA_ARCH__)
-#include "base/sizes.h"
     int ticket = 0;
     if (threadIdx.x == 0) {
         atomicAdd(counter.data + 2, 1);
@@ -125,7 +129,6 @@ inline CUDA_CALLABLE wp::int32 claim_slot(wp::array_t<wp::int32> counter, wp::ar
 
 inline CUDA_CALLABLE void fill_slot(wp::array_t<wp::int32> flag, wp::int32 ticket) {
 #if defined(__CUDA_ARCH__)
-#include "base/sizes.h"
     __threadfence();
     __syncwarp();
     if (threadIdx.x == 0)

@@ -2,10 +2,9 @@
 // tag, its time or its steps, and the slot of its object pair; behind them the times of those that go on.
 #pragma once
 #include "builtin.h"
-#include "base/sizes.h"
+#include "search/warp_stack.cuh"
 
 inline CUDA_CALLABLE wp::uint64 motion_stack() {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     __shared__ long long items[MOTION_WORDS];
     return __cvta_generic_to_shared(items);
@@ -16,57 +15,21 @@ inline CUDA_CALLABLE wp::uint64 motion_stack() {
 }
 
 inline CUDA_CALLABLE wp::float32 read_tag(wp::uint64 items, wp::int32 i) {
-#include "base/sizes.h"
-#if defined(__CUDA_ARCH__)
-    float tag;
-    asm volatile("ld.shared.f32 %0, [%1];"
-                 : "=f"(tag)
-                 : "r"((unsigned int)items + 8 * MOTION_LENGTH + 4 * i)
-                 : "memory");
-    return tag;
-#else
-    return ((const float*)((const long long*)items + MOTION_LENGTH))[i];
-#endif
+    return *entry<volatile float>(items, 2 * MOTION_LENGTH + i);
 }
 
 inline CUDA_CALLABLE wp::int32 read_slot(wp::uint64 items, wp::int32 i) {
-#include "base/sizes.h"
-#if defined(__CUDA_ARCH__)
-    unsigned int slot;
-    asm volatile("ld.shared.u8 %0, [%1];"
-                 : "=r"(slot)
-                 : "r"((unsigned int)items + 8 * (MOTION_TIMES_START + 2 * WARP_SIZE) + i)
-                 : "memory");
-    return slot;
-#else
-    return ((const unsigned char*)((const long long*)items + MOTION_TIMES_START + 2 * WARP_SIZE))[i];
-#endif
+    return *entry<volatile unsigned char>(items, 8 * (MOTION_TIMES_START + 2 * WARP_SIZE) + i);
 }
 
 inline CUDA_CALLABLE void write_entry(wp::uint64 items, wp::int32 i, wp::int64 item, wp::float32 tag, wp::int32 slot) {
-#include "base/sizes.h"
-#if defined(__CUDA_ARCH__)
-    const unsigned int start = items;
-    asm volatile("st.shared.b64 [%0], %1; st.shared.f32 [%2], %3; st.shared.u8 [%4], %5;" ::"r"(start + 8 * i),
-                 "l"((long long)item), "r"(start + 8 * MOTION_LENGTH + 4 * i), "f"(tag),
-                 "r"(start + 8 * (MOTION_TIMES_START + 2 * WARP_SIZE) + i), "r"(slot)
-                 : "memory");
-#else
-    long long* const start = (long long*)items;
-    start[i] = item;
-    ((float*)(start + MOTION_LENGTH))[i] = tag;
-    ((unsigned char*)(start + MOTION_TIMES_START + 2 * WARP_SIZE))[i] = slot;
-#endif
+    *entry<volatile long long>(items, i) = item;
+    *entry<volatile float>(items, 2 * MOTION_LENGTH + i) = tag;
+    *entry<volatile unsigned char>(items, 8 * (MOTION_TIMES_START + 2 * WARP_SIZE) + i) = slot;
 }
 
 inline CUDA_CALLABLE void write_time(wp::uint64 items, wp::int32 i, wp::float64 time) {
-#include "base/sizes.h"
-#if defined(__CUDA_ARCH__)
-    asm volatile("st.shared.f64 [%0], %1;" ::"r"((unsigned int)items + 8 * (MOTION_TIMES_START + i)), "d"(time)
-                 : "memory");
-#else
-    ((double*)items)[MOTION_TIMES_START + i] = time;
-#endif
+    *entry<volatile double>(items, MOTION_TIMES_START + i) = time;
 }
 
 inline CUDA_CALLABLE wp::int32 place_in(wp::int32 end, bool flag) {

@@ -2,10 +2,9 @@
 // those to be measured in float64, each with a bound of its distance.
 #pragma once
 #include "builtin.h"
-#include "base/sizes.h"
+#include "search/warp_stack.cuh"
 
 inline CUDA_CALLABLE wp::uint64 nearest_stack() {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     __shared__ long long items[NEAREST_LENGTH + NEAREST_LENGTH / 2];
     return __cvta_generic_to_shared(items);
@@ -20,33 +19,16 @@ inline CUDA_CALLABLE wp::uint64 thread_lists(wp::array_t<wp::int64> memory, wp::
 }
 
 inline CUDA_CALLABLE wp::float32 read_bound(wp::uint64 items, wp::int32 i) {
-#include "base/sizes.h"
-#if defined(__CUDA_ARCH__)
-    float bound;
-    asm volatile("ld.shared.f32 %0, [%1];"
-                 : "=f"(bound)
-                 : "r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * i)
-                 : "memory");
-    return bound;
-#else
-    return ((const float*)((const long long*)items + NEAREST_LENGTH))[i];
-#endif
+    return *entry<volatile float>(items, 2 * NEAREST_LENGTH + i);
 }
 
 inline CUDA_CALLABLE void write_bound(wp::uint64 items, wp::int32 i, wp::float32 bound) {
-#include "base/sizes.h"
-#if defined(__CUDA_ARCH__)
-    asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * i), "f"(bound)
-                 : "memory");
-#else
-    ((float*)((long long*)items + NEAREST_LENGTH))[i] = bound;
-#endif
+    *entry<volatile float>(items, 2 * NEAREST_LENGTH + i) = bound;
 }
 
 inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp::int32 leaf_end,
                                             wp::vec_t<4, wp::int32> kinds, wp::vec_t<4, wp::int64> children,
                                             wp::vec_t<4, wp::float32> bounds) {
-#include "base/sizes.h"
     // The nearest of each lane comes last, so that it is taken first.
     int order[5][2] = {{0, 1}, {2, 3}, {0, 2}, {1, 3}, {1, 2}};
 #pragma unroll
@@ -72,10 +54,8 @@ inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp:
         const int place = (end + __popc(nodes & below)) & (STACK_LENGTH - 1);
         const int at = kinds[k] == 1 ? place : STACK_LENGTH + leaf_end + __popc(faces & below);
         if (kinds[k] != 0) {
-            asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "l"(children[k]) : "memory");
-            asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * at),
-                         "f"(bounds[k])
-                         : "memory");
+            *entry<volatile long long>(items, at) = children[k];
+            *entry<volatile float>(items, 2 * NEAREST_LENGTH + at) = bounds[k];
         }
         end += __popc(nodes);
         leaf_end += __popc(faces);
@@ -92,7 +72,6 @@ inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp:
 
 inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp::vec_t<4, wp::int32> kinds,
                                              wp::vec_t<4, wp::int64> children) {
-#include "base/sizes.h"
     const int mine = (kinds[0] != 0) + (kinds[1] != 0) + (kinds[2] != 0) + (kinds[3] != 0);
 #if defined(__CUDA_ARCH__)
     int sum = mine;
@@ -106,10 +85,8 @@ inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp
     for (int k = 0; k < 4; ++k)
         if (kinds[k] != 0) {
             --at;
-            asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "l"(children[k]) : "memory");
-            asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * at),
-                         "f"((float)kinds[k])
-                         : "memory");
+            *entry<volatile long long>(items, at) = children[k];
+            *entry<volatile float>(items, 2 * NEAREST_LENGTH + at) = (float)kinds[k];
         }
     return top;
 #else
@@ -126,21 +103,15 @@ inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp
 
 inline CUDA_CALLABLE wp::int32 push_open(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item,
                                          wp::float32 bound) {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     const unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    const int at = NEAREST_OPEN_START + end + __popc(votes & ((1u << threadIdx.x) - 1u));
-    if (flag) {
-        asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "l"((long long)item) : "memory");
-        asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * at), "f"(bound)
-                     : "memory");
-    }
-    return end + __popc(votes);
+    const int at = end + __popc(votes & ((1u << threadIdx.x) - 1u)), more = __popc(votes);
 #else
-    if (flag) {
-        ((long long*)items)[NEAREST_OPEN_START + end] = item;
-        ((float*)((long long*)items + NEAREST_LENGTH))[NEAREST_OPEN_START + end] = bound;
-    }
-    return end + flag;
+    const int at = end, more = flag;
 #endif
+    if (flag) {
+        *entry<volatile long long>(items, NEAREST_OPEN_START + at) = item;
+        *entry<volatile float>(items, 2 * NEAREST_LENGTH + NEAREST_OPEN_START + at) = bound;
+    }
+    return end + more;
 }

@@ -1,12 +1,12 @@
 // Places of the items that node pair tests emit: one prefix sum over a warp for three lists.
 #pragma once
 #include "builtin.h"
+#include "base/shared.cuh"
 #include "base/sizes.h"
 
 inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp::vec_t<3, wp::int32> ends,
                                                            wp::vec_t<4, wp::int32> lists,
                                                            wp::vec_t<4, wp::int64> children) {
-#include "base/sizes.h"
     const int end = ends[0], slab_end = ends[1], leaf_end = ends[2];
 #if defined(__CUDA_ARCH__)
     unsigned int emitted[4];
@@ -32,10 +32,8 @@ inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp:
     for (int k = 0; k < 4; ++k) {
         unsigned int at;
         asm("shr.u32 %0, %1, %2;" : "=r"(at) : "r"(place), "r"(lists[k]));
-        asm volatile(
-            "{ .reg .pred used; setp.ne.u32 used, %0, 0; @used st.shared.v2.b32 [%1], {%2, %3}; }" ::"r"(emitted[k]),
-            "r"((unsigned int)items + (at & PLACE_MASK)), "r"((int)children[k]), "r"((int)(children[k] >> 32))
-            : "memory");
+        if (emitted[k] != 0)
+            *(volatile long long*)entry<char>(items, at & PLACE_MASK) = children[k];
         place += emitted[k];
     }
     const int more_items = (total >> STACK_LIST) / ITEM_BYTES;

@@ -1,10 +1,10 @@
 // Marks of one tree state, a bit each, in the shared memory of its block; on the CPU in an array that is given.
 #pragma once
 #include "builtin.h"
+#include "base/shared.cuh"
 #include "base/sizes.h"
 
 inline CUDA_CALLABLE wp::uint64 block_marks(wp::array_t<wp::uint32> scratch) {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     __shared__ unsigned int words[MARK_WORDS];
     return (unsigned int)__cvta_generic_to_shared(words);
@@ -14,7 +14,6 @@ inline CUDA_CALLABLE wp::uint64 block_marks(wp::array_t<wp::uint32> scratch) {
 }
 
 inline CUDA_CALLABLE wp::uint64 shallow_marks(wp::array_t<wp::uint32> scratch) {
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     __shared__ unsigned int words[SHALLOW_WORDS];
     return (unsigned int)__cvta_generic_to_shared(words);
@@ -24,55 +23,41 @@ inline CUDA_CALLABLE wp::uint64 shallow_marks(wp::array_t<wp::uint32> scratch) {
 }
 
 inline CUDA_CALLABLE wp::uint32 read_word(wp::uint64 marks, wp::int32 i) {
-#if defined(__CUDA_ARCH__)
-    unsigned int word;
-    asm volatile("ld.shared.b32 %0, [%1];" : "=r"(word) : "r"((unsigned int)marks + 4 * i) : "memory");
-    return word;
-#else
-    return ((const unsigned int*)marks)[i];
-#endif
+    return *entry<volatile unsigned int>(marks, i);
 }
 
-inline CUDA_CALLABLE void clear_word(wp::uint64 marks, wp::int32 i) {
-#if defined(__CUDA_ARCH__)
-    asm volatile("st.shared.b32 [%0], %1;" ::"r"((unsigned int)marks + 4 * i), "r"(0) : "memory");
-#else
-    ((unsigned int*)marks)[i] = 0;
-#endif
-}
+inline CUDA_CALLABLE void clear_word(wp::uint64 marks, wp::int32 i) { *entry<volatile unsigned int>(marks, i) = 0; }
 
 inline CUDA_CALLABLE void add_to_word(wp::uint64 marks, wp::int32 i, wp::int32 amount) {
 #if defined(__CUDA_ARCH__)
-    asm volatile("red.shared.add.u32 [%0], %1;" ::"r"((unsigned int)marks + 4 * i), "r"(amount) : "memory");
+    atomicAdd(entry<unsigned int>(marks, i), (unsigned int)amount);
 #else
-    ((unsigned int*)marks)[i] += amount;
+    *entry<unsigned int>(marks, i) += amount;
 #endif
 }
 
 inline CUDA_CALLABLE bool mark_bit(wp::uint64 marks, wp::int32 bit) {
-    unsigned int mask = 1u << (bit & 31), old;
+    const unsigned int mask = 1u << (bit & 31);
+    unsigned int* const word = entry<unsigned int>(marks, bit >> 5);
 #if defined(__CUDA_ARCH__)
-    unsigned int at = (unsigned int)marks + 4 * (bit >> 5);
-    asm volatile("atom.shared.or.b32 %0, [%1], %2;" : "=r"(old) : "r"(at), "r"(mask) : "memory");
+    const unsigned int old = atomicOr(word, mask);
 #else
-    unsigned int* word = (unsigned int*)marks + (bit >> 5);
-    old = *word;
+    const unsigned int old = *word;
     *word = old | mask;
 #endif
     return (old & mask) == 0;
 }
 
 inline CUDA_CALLABLE bool unmark_bit(wp::uint64 marks, wp::int32 bit) {
-    unsigned int mask = 1u << (bit & 31), old;
+    const unsigned int mask = 1u << (bit & 31);
+    unsigned int* const word = entry<unsigned int>(marks, bit >> 5);
 #if defined(__CUDA_ARCH__)
-    unsigned int at = (unsigned int)marks + 4 * (bit >> 5);
     // What this thread has written stands before the bit goes, and is read by the thread that finds it gone.
     __threadfence_block();
-    asm volatile("atom.shared.and.b32 %0, [%1], %2;" : "=r"(old) : "r"(at), "r"(~mask) : "memory");
+    const unsigned int old = atomicAnd(word, ~mask);
     __threadfence_block();
 #else
-    unsigned int* word = (unsigned int*)marks + (bit >> 5);
-    old = *word;
+    const unsigned int old = *word;
     *word = old & ~mask;
 #endif
     return (old & mask) != 0;

@@ -7,7 +7,6 @@ inline CUDA_CALLABLE wp::vec_t<2, wp::float64> apart_until(wp::mat_t<6, 6, wp::f
                                                            wp::mat_t<6, 6, wp::float64> ends,
                                                            wp::vec_t<3, wp::float64> away, wp::float64 error,
                                                            wp::float64 start, wp::float64 limit) {
-#include "exact/moving_faces.h"
     int reason;
     MovingFaces faces(starts.data, ends.data, error);
     // At time 0 nothing says that they are apart: they are if B's face comes there and meets nothing on that way.

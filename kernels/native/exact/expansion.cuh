@@ -6,8 +6,6 @@
 
 inline CUDA_CALLABLE wp::float64 sum_volume(wp::vec_t<3, wp::float64> a, wp::vec_t<3, wp::float64> b,
                                             wp::vec_t<3, wp::float64> c, wp::vec_t<3, wp::float64> d) {
-#include "exact/expansion_sum.h"
-#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     // Of odd length, so that lanes at the same component take different banks.
     __shared__ double rows[EXPANSION_LANES][EXPANSION_LENGTH + 1];
@@ -33,7 +31,6 @@ inline CUDA_CALLABLE wp::float64 sum_volume(wp::vec_t<3, wp::float64> a, wp::vec
 
 inline CUDA_CALLABLE wp::float64 sum_area(wp::vec_t<2, wp::float64> a, wp::vec_t<2, wp::float64> b,
                                           wp::vec_t<2, wp::float64> c) {
-#include "exact/expansion_sum.h"
     double row[16];  // products of two: eight of two words, and their zeros
     ExpansionSum sum = {row, 0};
     double u[2], v[2], u_low[2], v_low[2];
