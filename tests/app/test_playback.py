@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from helpers import refused
 from helpers.viewer import BODIES, make_models, make_playback, write_scene
 
 import warp_abtree as ab
@@ -48,8 +49,7 @@ def test_a_scene_plays_as_it_runs(tmp_path, device):
         assert np.array_equal(snapshot.poses, loaded.motion.poses(0.25 * k))
     playback.choose("predictive", 50.0)
     assert playback.budget_ms == 50 and playback.step("count").row.budget_ms == 50
-    with pytest.raises(ValueError, match="needs lod"):
-        playback.choose("tolerance")
+    refused(ValueError, "needs lod", playback.choose, "tolerance")
     assert playback.budget_ms == 50
     playback.hold([3] * len(playback.chosen))
     assert playback.step("count").lods[0] == 3

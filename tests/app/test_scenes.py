@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from helpers import refused
 from helpers.samples import true_faces
 from helpers.viewer import write_scene
 from msgspec import convert, toml
@@ -198,8 +199,7 @@ def test_controllers_of_a_file(tmp_path):
         (plain, {"controller": "tolerance"}, "needs lod.tolerance"),
         (plain, {"controller": "x"}, "none of"),
     ):
-        with pytest.raises(ValueError, match=message):
-            source.frame(**asked)
+        refused(ValueError, message, source.frame, **asked)
 
 
 @pytest.mark.slow

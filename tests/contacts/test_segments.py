@@ -146,18 +146,12 @@ def test_answers_of_either_sort(device, options):
             listed = [faces.run().faces, faces.run().faces, faces.result(device=True).faces.numpy()]
             assert (int(query.hits.count.numpy().sum()) == len(result.faces)) and len(result.faces) > 500
         answers.append([getattr(result, name).tobytes() for name in ("count", "faces", "contacts", "pair_contacts")])
+        with testing.regime(segments=segments, warps=True):
+            points = ab.ManifoldQuery(scene, pairs, gap=options.get("gap")).run().points
+        answers[-1] += [values.tobytes() for values in points.values()]
+        assert len(points["pair"]) > 0
         answers[-1] += [query.start.numpy().tobytes(), *(rows.tobytes() for rows in listed)]
     assert answers[0] == answers[1]
-
-
-def test_points_of_either_sort(device):
-    scene, pairs, _ = laid_out(device)
-    answers = []
-    for segments in (False, True):
-        with testing.regime(segments=segments, warps=True):
-            points = ab.ManifoldQuery(scene, pairs).run().points
-        answers.append([values.tobytes() for values in points.values()])
-    assert answers[0] == answers[1] and len(answers[0][0]) > 0
 
 
 def test_sort_in_a_graph(device):

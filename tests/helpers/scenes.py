@@ -95,3 +95,12 @@ def check_same(result, expected):
     assert got.keys() == wanted.keys()
     for name, value in wanted.items():
         assert np.array_equal(got[name].astype(value.dtype).tobytes(), value.tobytes()), name
+
+
+def scene_with(device, *objects, **options):
+    """Return a scene of models, each alone or as (model, pose) or (model, pose, its own options)."""
+    scene = ab.Scene(device)
+    for model, *more in (each if isinstance(each, tuple) else (each,) for each in objects):
+        own = more.pop() if len(more) == 2 else {}
+        scene.add(model, *more, **{**options, **own})
+    return scene

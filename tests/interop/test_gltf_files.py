@@ -8,6 +8,7 @@ import struct
 import numpy as np
 import pytest
 import trimesh
+from helpers import refused
 
 import warp_abtree as ab
 
@@ -204,8 +205,7 @@ def test_files_refused(tmp_path, where, change, message):
 def test_compressed_and_cut_files(tmp_path):
     tree, blob = tree_of([POINTS, CORNERS], [SOLID])
     (tmp_path / "a.glb").write_bytes(glb(tree, blob)[:-20])
-    with pytest.raises(ab.MeshError, match="cut short"):
-        ab.Model.load(tmp_path / "a.glb")
+    refused(ab.MeshError, "cut short", ab.Model.load, tmp_path / "a.glb")
     for accessor in tree["accessors"]:
         del accessor["bufferView"]
     packed = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}

@@ -5,6 +5,7 @@ import signal
 import sys
 
 import pytest
+from helpers import refused
 from helpers.jobs import ColumnJob, contents, job_of, run, stop_after
 
 from warp_abtree.jobs import RayPool, run_shards
@@ -71,12 +72,10 @@ class FailingJob(ColumnJob):
 def test_a_shard_that_cannot_be_computed_is_given_up(tmp_path, pool, how, error, what):
     for module in (__name__, ColumnJob.__module__):  # workers cannot import the tests
         pool.ray.cloudpickle.register_pickle_by_value(sys.modules[module])
-    with pytest.raises(error, match=what):
-        run_shards(FailingJob(count=40, shard=10, output=how), tmp_path / "out", pool=pool)
+    refused(error, what, run_shards, FailingJob(count=40, shard=10, output=how), tmp_path / "out", pool=pool)
     assert not (tmp_path / "out" / "shard-000000000020-000000000030.npz").exists()
 
 
 @pytest.mark.parametrize("workers", [0, -1, 1.5])
 def test_workers_are_counted_from_one(workers):
-    with pytest.raises(ValueError, match=f"^workers {workers} is "):
-        RayPool(workers=workers)
+    refused(ValueError, f"^workers {workers} is ", RayPool, workers=workers)

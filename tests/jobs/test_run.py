@@ -6,6 +6,7 @@ import threading
 
 import numpy as np
 import pytest
+from helpers import refused
 from helpers.jobs import contents, job_of, lods_of, pair, poses_of, run, stop_after
 
 from warp_abtree.jobs import SweepJob, ThisProcess, read_shards, run_shards, sweep_job
@@ -23,8 +24,7 @@ def test_several_devices_of_one_process_write_the_same(device, tmp_path, output)
         run(job, tmp_path / "four", device=[device] * 4, progress=stop_after(6))
     assert run(job, tmp_path / "four", device=[device] * 2)["kept"] == 6
     assert contents(tmp_path / "four") == contents(tmp_path / "one")
-    with pytest.raises(ValueError, match="an empty list"):
-        ThisProcess([])
+    refused(ValueError, "an empty list", ThisProcess, [])
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -62,8 +62,7 @@ def test_an_interrupted_job_continues(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         run(job, out, progress=stop_after(4))
     assert len(list(out.glob("shard-*.npz"))) == 4
-    with pytest.raises(ValueError, match="8 of 12 shards are missing"):
-        list(read_shards(out))
+    refused(ValueError, "8 of 12 shards are missing", list, read_shards(out))
     (out / "shard-000000000099-000000000100.npz.77-0123abcd.partial").write_bytes(b"half")
     computed = []
     monkeypatch.setattr(again, "task", lambda *part: computed.append(part) or job.task(*part))
@@ -81,18 +80,15 @@ def test_a_pipe_is_no_shard(tmp_path):
     path = out / "shard-000000000010-000000000020.npz"
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(ValueError, match="1 of 2 shards are missing"):
-        list(read_shards(out))
-    with pytest.raises(OSError, match="is neither a file nor a folder"):
-        run(job, out)
+    refused(ValueError, "1 of 2 shards are missing", list, read_shards(out))
+    refused(OSError, "is neither a file nor a folder", run, job, out)
 
 
 def test_files_of_other_programs_stay(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "film.partial").write_text("half")
-    with pytest.raises(ValueError, match="is not empty"):
-        run(job_of("any", count=20), out)
+    refused(ValueError, "is not empty", run, job_of("any", count=20), out)
     (out / "film.partial").unlink()
     run(job_of("any", count=20), out)
     (out / "film.partial").write_text("half")
@@ -112,8 +108,7 @@ def test_a_folder_is_of_one_job(tmp_path):
         ("lods", SweepJob(a, b, poses, [3, 3], shard=50)),
         ("models", SweepJob(b, a, poses, shard=50)),
     ):
-        with pytest.raises(ValueError, match=f"holds another job; not the same: .*{what}"):
-            run(other, tmp_path / "out")
+        refused(ValueError, f"holds another job; not the same: .*{what}", run, other, tmp_path / "out")
     assert contents(tmp_path / "out") == before
 
 
@@ -127,10 +122,8 @@ def test_folders_that_are_no_jobs_are_refused(tmp_path):
         ("none/out", "there is no folder"),
         ("bad", "damaged"),
     ):
-        with pytest.raises(ValueError, match=what):
-            run(job_of(), tmp_path / out)
-    with pytest.raises(ValueError, match=r"holds no job\.json"):
-        list(read_shards(tmp_path / "full"))
+        refused(ValueError, what, run, job_of(), tmp_path / out)
+    refused(ValueError, r"holds no job\.json", list, read_shards(tmp_path / "full"))
     assert not (tmp_path / "new").exists()
 
 
@@ -143,5 +136,4 @@ def test_a_pool_that_answers_twice_or_not_at_all_is_detected(tmp_path, deal, wha
         def run(self, job, ranges):
             return super().run(job, deal(ranges))
 
-    with pytest.raises(RuntimeError, match=what):
-        run_shards(job_of(), tmp_path / "out", pool=Pool("cpu"))
+    refused(RuntimeError, what, run_shards, job_of(), tmp_path / "out", pool=Pool("cpu"))

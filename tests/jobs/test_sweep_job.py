@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers import refused
 from helpers.jobs import intersect, lods_of, pair, poses_of, read, run
 from helpers.samples import sample
 
@@ -78,7 +79,5 @@ def test_bad_input_is_named(tmp_path, monkeypatch):
         (poses_of(), {"precision": "good"}, "precision 'good'"),
         (poses_of(), {"shard": 0}, "shard 0 is outside"),
     ):
-        with pytest.raises(ValueError, match=what):
-            SweepJob(*pair(), poses, **options)
-    with pytest.raises(TypeError, match="not a Model"):
-        SweepJob("torus", sample("torus"), poses_of())
+        refused(ValueError, what, SweepJob, *pair(), poses, **options)
+    refused(TypeError, "not a Model", SweepJob, "torus", sample("torus"), poses_of())

@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import warp as wp
+from helpers import refused
 from helpers.bodies import selection_models, strewn
 
 import warp_abtree as ab
@@ -165,8 +166,7 @@ def test_tolerance_gives_the_coarsest_level_within_it(device):
     ],
 )
 def test_controllers_refuse(make, error, words):
-    with pytest.raises(error, match=words):
-        make(strewn(3, "cpu"))
+    refused(error, words, make, strewn(3, "cpu"))
 
 
 def test_a_controller_refuses_another_scene_than_it_was_made_for(device):
@@ -174,8 +174,7 @@ def test_a_controller_refuses_another_scene_than_it_was_made_for(device):
     controller = PaperController(scene, 8.0)
     scene.add(selection_models()[0])
     for call in (controller.view.launch, lambda: controller.next_lods(Feedback(0.0))):
-        with pytest.raises(RuntimeError, match="objects were added"):
-            call()
+        refused(RuntimeError, "objects were added", call)
 
 
 # Graphs.

@@ -7,6 +7,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import trimesh
+from helpers import refused
 from hypothesis import example, given
 
 from warp_abtree.model.mesh import MeshError, describe_mesh, mesh_from_arrays
@@ -49,12 +50,10 @@ def test_random_soups(soup):
     corners = [{tuple(x + 0.0) for x in vertices[face]} for face in faces]
     dropped = [f for f, corner in enumerate(corners) if len(corner) < 3]
     if len(dropped) == len(faces):
-        with pytest.raises(MeshError, match="three distinct corners"):
-            mesh_from_arrays(vertices, faces)
+        refused(MeshError, "three distinct corners", mesh_from_arrays, vertices, faces)
         return
     if np.ptp(vertices[faces].reshape(-1, 3), axis=0).max() < 2.0**-100:
-        with pytest.raises(MeshError, match="extent"):
-            mesh_from_arrays(vertices, faces)
+        refused(MeshError, "extent", mesh_from_arrays, vertices, faces)
         return
     mesh = mesh_from_arrays(vertices, faces)
     np.testing.assert_array_equal(mesh.vertices[mesh.faces], vertices[faces])

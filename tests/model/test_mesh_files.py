@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 import trimesh
+from helpers import refused
 
 from warp_abtree.model.files.found import Remarks
 from warp_abtree.model.files.obj import read_obj
@@ -182,8 +183,7 @@ def test_source_errors(monkeypatch):
         (trimesh.Scene(), "no faces"),
         (beyond, "face 0 has corners"),
     ):
-        with pytest.raises(MeshError, match=message):
-            load_mesh(source)
+        refused(MeshError, message, load_mesh, source)
 
 
 @pytest.mark.parametrize(

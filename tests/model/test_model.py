@@ -8,6 +8,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from helpers import refused
 from helpers.samples import SHAPES, sample
 
 import warp_abtree as ab
@@ -238,8 +239,7 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr(np, "savez_compressed", fail)
     for target in (path, tmp_path / "new.npz"):
-        with pytest.raises(OSError, match="disk full"):
-            other.save(target)
+        refused(OSError, "disk full", other.save, target)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["m.npz"]
     monkeypatch.undo()
@@ -256,15 +256,12 @@ def test_lods_and_requests_of_lods_are_checked():
     model = sample("twins")
     for lod in (-1, 10**6, 0.5, True, "1"):
         for call in (model.mesh_at, model.error_at, lambda lod: model.error_at(lod, side="outward")):
-            with pytest.raises(ValueError, match=f"LOD.*{lod}"):
-                call(lod)
+            refused(ValueError, f"LOD.*{lod}", call, lod)
     for options in ({}, {"fraction": 0.1, "tolerance": 0.1}):
-        with pytest.raises(ValueError, match=r"fraction|tolerance"):
-            model.lod_for(**options)
+        refused(ValueError, r"fraction|tolerance", model.lod_for, **options)
     bad = {"fraction": (0.0, 1.001, float("nan"), "half"), "tolerance": (-1e-9, float("nan"), "fine")}
     for name, value in [(name, value) for name, values in bad.items() for value in values]:
-        with pytest.raises((ValueError, TypeError), match=name):
-            model.lod_for(**{name: value})
+        refused((ValueError, TypeError), name, model.lod_for, **{name: value})
     for source in (None, 3, "no/such/file.obj"):
         with pytest.raises(ab.MeshError):
             Model.load(source)

@@ -3,6 +3,7 @@
 import hypothesis.strategies as st
 import numpy as np
 import pytest
+from helpers import refused
 from helpers.samples import plain, raw_state, repeated, sample, soup
 from hypothesis import HealthCheck, given, settings
 from oracles import abtree as oracle
@@ -36,8 +37,7 @@ def test_build_of_soups_equals_the_oracle(count, seed, lattice, scale):
 
 
 def test_build_refuses_no_face():
-    with pytest.raises(ValueError, match="1 to 2"):
-        active_build(np.zeros((3, 3)), np.zeros((0, 3), np.int32))
+    refused(ValueError, "1 to 2", active_build, np.zeros((3, 3)), np.zeros((0, 3), np.int32))
 
 
 # Update.

@@ -5,6 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import warp as wp
+from helpers import refused
 from helpers.motions import ANSWERS, STILL, find, random_motions, to_bytes
 from helpers.questions import pairs_of, scene_of
 from helpers.samples import random_poses, random_quaternions, sample
@@ -271,8 +272,7 @@ def test_bad_input(device):
         scene.add(sample("box"), (x, 0, 0, 0, 0, 0, 1))
     ends = np.array([STILL, STILL])
     for tolerance in (0, 1, -1, np.nan, "a", 2.0**-41, [1e-6]):
-        with pytest.raises(ValueError, match="tolerance"):
-            scene.first_contact([(0, 1)], ends, tolerance=tolerance)
+        refused(ValueError, "tolerance", scene.first_contact, [(0, 1)], ends, tolerance=tolerance)
     for bad, message in (
         (ends[:1], "1 given for 2"),
         (ends[0], "shape"),
@@ -281,8 +281,7 @@ def test_bad_input(device):
         (np.array([STILL, [0, 0, 0, 0, 0, 1, 0]]), "half a revolution"),
         (np.array([STILL, [0, 0, 0, 0, 1, 0, 1e-8]]), "half a revolution"),
     ):
-        with pytest.raises(ValueError, match=message):
-            scene.first_contact([(0, 1)], bad)
+        refused(ValueError, message, scene.first_contact, [(0, 1)], bad)
     with pytest.raises(ValueError):
         scene.first_contact([(0, 2)], ends)
     assert scene.first_contact([(0, 1)], np.array([STILL, [3, 0, 0, 0, 0, 1, 1e-5]])).clear.all()
@@ -312,8 +311,7 @@ def test_sweeps(device, path):
         ({"end_poses": ends, "beyond": 1.0}, TypeError, "beyond"),
         ({"end_poses": ends, "tolerance": 2}, ValueError, "tolerance"),
     ):
-        with pytest.raises(error, match=message):
-            ab.sweep(a, b, starts, **{**options, **bad})
+        refused(error, message, ab.sweep, a, b, starts, **{**options, **bad})
     assert len(ab.sweep(a, b, np.empty((0, 7)), end_poses=np.empty((0, 7)), **options)) == 0
 
 

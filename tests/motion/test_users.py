@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from helpers import refused
 from trimesh.transformations import rotation_matrix, translation_matrix
 
 import warp_abtree as ab
@@ -31,5 +32,4 @@ def test_collision_manager(device):
         ({"c": 2 * np.eye(4)}, "not rigid"),
         ({"c": rotation_matrix(np.pi, (0, 0, 1))}, "half a revolution"),
     ):
-        with pytest.raises(ValueError, match=message):
-            manager.first_contact_internal(ends)
+        refused(ValueError, message, manager.first_contact_internal, ends)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from conftest import slow
+from helpers import refused
 from helpers.faults import MORE_PAIRS, PAIRS, check_scene, describe, make_scene
 from helpers.questions import GpuQuery
 from helpers.samples import sample
@@ -104,8 +105,7 @@ def test_the_error_names_the_bytes(device, asked, monkeypatch):
         lambda: GpuQuery(scene, "faces", pairs=PAIRS, capacity=ab.Buffers(uncertain=2**31 - 1)),
         lambda: query.resize(2**31 - 1),
     ):
-        with pytest.raises(RuntimeError, match=f"bytes on device '{device}'"):
-            call()
+        refused(RuntimeError, f"bytes on device '{device}'", call)
         assert sizes[-1] == 12 * (2**31 - 1)
         check()
 
@@ -114,10 +114,8 @@ def test_more_pairs_than_a_launch_holds(asked, monkeypatch):
     monkeypatch.setattr(request, "PAIRS_MAX", len(MORE_PAIRS))
     scene, query, check = asked
     ab.Query(scene, pairs=MORE_PAIRS)  # as many as it holds
-    with pytest.raises(ValueError, match="buffers: pairs 13 is outside"):
-        ab.Query(scene, "any", capacity=ab.Buffers(pairs=13))
+    refused(ValueError, "buffers: pairs 13 is outside", ab.Buffers, pairs=13)
     many = np.concatenate([MORE_PAIRS, PAIRS])
     for call in (lambda: query.set_pairs(many), lambda: scene.intersect(many), lambda: ab.Query(scene, pairs=many)):
-        with pytest.raises(ab.CapacityError, match="15 object pairs at a time"):
-            call()
+        refused(ab.CapacityError, "15 object pairs at a time", call)
         check()

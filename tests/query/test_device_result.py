@@ -5,6 +5,7 @@ import gc
 import numpy as np
 import pytest
 import warp as wp
+from helpers import refused
 from helpers.faults import MORE_PAIRS, add_objects, describe
 from helpers.questions import GpuQuery, in_a_row
 from helpers.samples import random_poses
@@ -148,15 +149,13 @@ def test_overflow_is_told(device, packs, output, keeps):
     query.launch()
     short = query.result(device=keeps)
     assert len(short.faces) == 5
-    with pytest.raises(ab.CapacityError, match=rf"Buffers\(hits={len(whole.faces)}\)"):
-        short.check()
+    refused(ab.CapacityError, rf"Buffers\(hits={len(whole.faces)}\)", short.check)
     assert len(query.run(device=keeps).faces) == len(whole.faces)
     found = make_query(scene, output, pairs=None, capacity=ab.Buffers(pairs=2))
     found.launch()
     short = found.result(device=keeps)
     assert len(short.pairs) == 2
-    with pytest.raises(ab.CapacityError, match=rf"Buffers\(pairs={len(scene.broad_phase())}\)"):
-        short.check()
+    refused(ab.CapacityError, rf"Buffers\(pairs={len(scene.broad_phase())}\)", short.check)
 
 
 def test_uncertain_face_pairs_are_counted_on_the_device(device, packs):
@@ -175,8 +174,7 @@ def test_uncertain_face_pairs_are_counted_on_the_device(device, packs):
 def test_without_a_launch_there_is_no_result(device, packs, keeps):
     query = ab.Query(add_objects(device), "faces", pairs=MORE_PAIRS)
     for _ in range(2):
-        with pytest.raises(RuntimeError, match="nothing was launched"):
-            query.result(device=keeps)
+        refused(RuntimeError, "nothing was launched", query.result, device=keeps)
         assert query.run(device=keeps).any.shape == (len(MORE_PAIRS),)
         query.set_pairs(MORE_PAIRS)
 
@@ -293,5 +291,4 @@ def test_results_have_a_length_and_no_truth_value(device, on_device):
                 lambda result: 1 if result else 0,
                 lambda result: any([result]),
             ):
-                with pytest.raises(TypeError, match="a Result is neither true nor false; ask result"):
-                    ask(result)
+                refused(TypeError, "a Result is neither true nor false; ask result", ask, result)

@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+from helpers import refused
 from helpers.robots import MJCF, URDF, random_configurations, write_arm
 
 import warp_abtree as ab
@@ -158,8 +159,7 @@ def test_a_limit_that_urdf_leaves_out_is_zero(urdf):
 def test_bad_urdf_is_refused(urdf, before, after, message):
     assert before in URDF
     urdf.write_text(URDF.replace(before, after), encoding="utf-8")
-    with pytest.raises(ValueError, match=message):
-        ab.Robot.load(urdf, device="cpu")
+    refused(ValueError, message, ab.Robot.load, urdf, device="cpu")
 
 
 @pytest.mark.parametrize(
@@ -188,8 +188,7 @@ def test_bad_urdf_is_refused(urdf, before, after, message):
 def test_bad_mjcf_is_refused(mjcf, before, after, message):
     assert before in MJCF
     mjcf.write_text(MJCF.replace(before, after), encoding="utf-8")
-    with pytest.raises(ValueError, match=message):
-        ab.Robot.load(mjcf, device="cpu")
+    refused(ValueError, message, ab.Robot.load, mjcf, device="cpu")
 
 
 def test_formats_are_told_apart_and_a_geometry_without_meshes_is_named(urdf, mjcf, tmp_path):
@@ -199,8 +198,7 @@ def test_formats_are_told_apart_and_a_geometry_without_meshes_is_named(urdf, mjc
     ):
         # A comment before the root counts for nothing.
         (tmp_path / name).write_text("<!-- <mujoco> <robot> -->" + source.read_text("utf-8"), encoding="utf-8")
-        with pytest.raises(ValueError, match=message):
-            ab.Robot.load(tmp_path / name, device="cpu")
+        refused(ValueError, message, ab.Robot.load, tmp_path / name, device="cpu")
     urdf.write_text(
         '<robot name="r"><link name="l"><visual><geometry><sphere radius="1"/></geometry></visual></link></robot>'
     )
@@ -278,8 +276,7 @@ def test_bad_paths_and_options_are_refused(urdf, tmp_path):
         ({"path": urdf, "neutral": [0, 0]}, r"shape \(1, 2\)"),
         ({"path": urdf, "device": "cuda:9"}, "no device 'cuda:9'"),
     ):
-        with pytest.raises(ValueError, match=message):
-            ab.Robot.load(**arguments)
+        refused(ValueError, message, ab.Robot.load, **arguments)
 
 
 @pytest.mark.parametrize("name, library", [("arm.urdf", "yourdfpy"), ("arm.xml", "mujoco")])
