@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-import warp as wp
 from helpers import refused
-from helpers.questions import pairs_of, random_case, scene_of
+from helpers.questions import captured, pairs_of, random_case, scene_of
 from helpers.samples import sample
 
 import warp_abtree as ab
@@ -39,22 +38,20 @@ def make_turns(rng, device, count):
 @pytest.mark.parametrize("warps", [True, False])
 def test_a_graph_answers_what_is_in_place(device, warps):
     """Captured before there was a launch; and calls one after the other, from the fourth on a graph on a GPU."""
-    rng = np.random.default_rng(15)
-    scene, turns = make_turns(rng, device, 8)
+    scene, turns = make_turns(np.random.default_rng(15), device, 8)
     if scene.device.is_cuda and not warps:
         pytest.skip("CUDA has warps alone")
     met = []
     with testing.regime(warps=warps):
-        captured, called = (ab.DistanceQuery(scene, turns[0][1][::-1]) for _ in range(2))
-        with wp.ScopedCapture(scene.device) as capture:
-            captured.launch()
+        first, called = (ab.DistanceQuery(scene, turns[0][1][::-1]) for _ in range(2))
+        replay = captured(first)
         for poses, pairs in turns:
             scene.set_poses(poses)
             expected = ab.DistanceQuery(scene, pairs).run()
-            for query in (captured, called):
+            for query in (first, called):
                 query.set_pairs(pairs)
-            wp.capture_launch(capture.graph)
-            assert to_bytes(captured.result()) == to_bytes(expected)
+            replay()
+            assert to_bytes(first.result()) == to_bytes(expected)
             assert to_bytes(called.run()) == to_bytes(expected)
             met.append(expected.any.mean())
     assert 0.2 < np.mean(met) < 0.8
@@ -67,12 +64,11 @@ def test_graphs_captured_first_and_stale_ones(device):
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     query = ab.DistanceQuery(scene, pairs)
     for turn in range(2):
-        with wp.ScopedCapture(query.device) as capture:
-            query.launch()
+        replay = captured(query)
         for _ in range(3):
-            wp.capture_launch(capture.graph)
+            replay()
         assert to_bytes(query.result()) == to_bytes(ab.DistanceQuery(scene, pairs).run())
         scene.set_lods([model.lod_max - 5 * i - 7 * turn for i, model in enumerate(scene.models * 4)])
-        wp.capture_launch(capture.graph)
+        replay()
         if turn == 0:
             refused(RuntimeError, "captured before arrays that it uses were replaced", query.result)

@@ -34,8 +34,7 @@ def meets(scene, cases, ends, times):
 
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-3])
 def test_never_late_and_early_by_the_tolerance(device, tolerance):
-    rng = np.random.default_rng(1)
-    cases, ends = random_motions(rng, 160)
+    cases, ends = random_motions(np.random.default_rng(1), 160)
     scene = scene_of(device, cases)
     result = scene.first_contact(pairs_of(cases), ends, tolerance=tolerance)
     time = result.time
@@ -53,8 +52,7 @@ def test_never_late_and_early_by_the_tolerance(device, tolerance):
 
 def test_agrees_with_steps_of_the_distance(device):
     """A bound of all speeds over brute-force distances proves nothing that the answer does not say too."""
-    rng = np.random.default_rng(2)
-    cases, ends = random_motions(rng, 12, ("box", "three", "one", "crumbs"), 20)
+    cases, ends = random_motions(np.random.default_rng(2), 12, ("box", "three", "one", "crumbs"), 20)
     result = find(device, cases, ends)
     for case, path, time in zip(cases, ends.reshape(-1, 2, 7), result.time, strict=True):
         if time == 0:
@@ -126,8 +124,7 @@ def test_order_of_objects_and_of_pairs_changes_nothing(device):
 
 
 def test_regimes_agree(device):
-    rng = np.random.default_rng(6)
-    cases, ends = random_motions(rng, 40, faces=500)
+    cases, ends = random_motions(np.random.default_rng(6), 40, faces=500)
     first = to_bytes(find(device, cases, ends))
     for warps, length in ((True, None), (True, 129), (None, 200)):
         with testing.regime(warps=warps, stack_length=length, cpu_threads=1 if length else 2):
@@ -135,8 +132,7 @@ def test_regimes_agree(device):
 
 
 def test_warps_that_take_a_group_of_pairs_agree(device):
-    rng = np.random.default_rng(8)
-    cases, ends = random_motions(rng, 65, faces=30)
+    cases, ends = random_motions(np.random.default_rng(8), 65, faces=30)
     pairs = np.array([(i, j) for j in range(len(ends)) for i in range(j)])
     assert len(pairs) > int(group.GROUPED_LEAST) and len(pairs) % int(group.GROUP)
     found = []
@@ -150,8 +146,7 @@ def test_warps_that_take_a_group_of_pairs_agree(device):
 
 @pytest.mark.parametrize("exponent", [-40, 40])
 def test_scaling_by_a_power_of_two_changes_nothing(device, exponent):
-    rng = np.random.default_rng(7)
-    cases, ends = random_motions(rng, 24)
+    cases, ends = random_motions(np.random.default_rng(7), 24)
     first = find(device, cases, ends)
     factor, scaled = 2.0**exponent, []
     for model_a, lod_a, pose_a, model_b, lod_b, pose_b in cases:
@@ -186,8 +181,7 @@ def test_screws_end_where_they_should_and_keep_their_distance_from_the_axis(devi
 
 
 def test_resting_and_parting_objects_are_clear(device):
-    rng = np.random.default_rng(8)
-    cases, _ = random_motions(rng, 30)
+    cases, _ = random_motions(np.random.default_rng(8), 30)
     scene, starts = scene_of(device, cases), starts_of(cases)
     met = scene.intersect(pairs_of(cases)).any
     rest = scene.first_contact(pairs_of(cases), starts)
@@ -249,8 +243,7 @@ def test_calls_that_repeat_take_other_options(device):
 
 
 def test_captured_graphs(device):
-    rng = np.random.default_rng(10)
-    cases, ends = random_motions(rng, 20)
+    cases, ends = random_motions(np.random.default_rng(10), 20)
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     query = ab.FirstContactQuery(scene, ends, pairs)
     first = query.run()

@@ -23,8 +23,7 @@ def soups_intersect(a, b):
 
 
 def test_never_late_and_early_by_the_tolerance(device):
-    rng = np.random.default_rng(1)
-    cases, ends = random_motions(rng, 40, ("box", "small ball", "torus", "soup"), 40, 1.5)
+    cases, ends = random_motions(np.random.default_rng(1), 40, ("box", "small ball", "torus", "soup"), 40, 1.5)
     result = find(device, cases, ends, linear=True)
     assert not result.undecided.any() and 10 < result.clear.sum() < 35 and (result.time == 0).sum() < 10
     for case, path, time, clear in zip(cases, ends.reshape(-1, 2, 7), result.time, result.clear, strict=True):
@@ -39,16 +38,14 @@ def test_never_late_and_early_by_the_tolerance(device):
 
 
 def test_regimes_agree(device):
-    rng = np.random.default_rng(2)
-    cases, ends = random_motions(rng, 30, faces=500)
+    cases, ends = random_motions(np.random.default_rng(2), 30, faces=500)
     first = to_bytes(find(device, cases, ends, linear=True))
     with testing.regime(warps=True):
         assert to_bytes(find(device, cases, ends, linear=True)) == first
 
 
 def test_without_turns_it_is_the_rigid_motion(device):
-    rng = np.random.default_rng(3)
-    cases, ends = random_motions(rng, 30)
+    cases, ends = random_motions(np.random.default_rng(3), 30)
     for case, path in zip(cases, ends.reshape(-1, 2, 7)):
         path[:, 3:] = case[2][3:], case[5][3:]
     rigid, straight = (find(device, cases, ends, linear=linear) for linear in (False, True))

@@ -41,8 +41,7 @@ def test_sines_are_those_of_float64(device):
 
 @pytest.mark.parametrize("angle", [3.14159, 3.0, 1.0, 1e-3, 1e-9, 1e-15, 0.0])
 def test_turns_are_found_again(device, angle):
-    rng = np.random.default_rng(1)
-    axes = rng.normal(size=(200, 3))
+    axes = np.random.default_rng(1).normal(size=(200, 3))
     axes /= np.linalg.norm(axes, axis=1)[:, None]
     turns = np.array([quaternion_matrix([*(math.sin(angle / 2) * axis), math.cos(angle / 2)]) for axis in axes])
     found = launch(turn_kernel, device, len(turns), turns, columns=10)

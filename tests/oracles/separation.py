@@ -9,14 +9,14 @@ import math
 
 import numpy as np
 
-from oracles.triangle import box_pairs, triangles_intersect
-from oracles.triangle_distance import cross, dot, minus, to_integers, triangle_distance
+from oracles.triangle import box_pairs, cross, dot, integer_points, lowest_exponent, triangles_intersect
+from oracles.triangle import sub as minus
+from oracles.triangle_distance import triangle_distance
 
 
 def crossing_depth(a, b):
     """Return the shortest motion that parts two triangles which intersect, to the rounding of a division and a root."""
-    corners, exponent = to_integers(np.stack([a, b]))
-    a, b = [[tuple(corner) for corner in triangle] for triangle in corners.tolist()]
+    (a, b), exponent = integer_points(a, b), lowest_exponent(a, b)
     differences = [minus(p, q) for p, q in itertools.product(a, b)]
     least = None
     for x, y, z in itertools.combinations(differences, 3):

@@ -7,29 +7,8 @@ by itself and only where it lies inside.
 import itertools
 import math
 
-import numpy as np
-
-
-def to_integers(corners):
-    """Return float64 numbers as integers on a common exponent, and the exponent."""
-    fraction, exponent = np.frexp(corners)
-    used = corners != 0
-    least = int(exponent[used].min()) - 53 if used.any() else 0
-    mantissa = np.ldexp(fraction, 53).astype(np.int64)
-    flat = [int(m) << max(int(e) - 53 - least, 0) if m else 0 for m, e in zip(mantissa.flat, exponent.flat)]
-    return np.array(flat, object).reshape(corners.shape), least
-
-
-def dot(u, v):
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
-
-
-def cross(u, v):
-    return (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
-
-
-def minus(u, v):
-    return (u[0] - v[0], u[1] - v[1], u[2] - v[2])
+from oracles.triangle import cross, dot, integer_points, lowest_exponent
+from oracles.triangle import sub as minus
 
 
 def over_edges(w, e):
@@ -58,8 +37,7 @@ def over_face(p, a, b, c):
 
 def triangle_distance(a, b):
     """Return the distance of triangles float64 (3, 3) each, to the rounding of one division and one root."""
-    corners, exponent = to_integers(np.stack([a, b]))
-    a, b = [[tuple(corner) for corner in triangle] for triangle in corners.tolist()]
+    (a, b), exponent = integer_points(a, b), lowest_exponent(a, b)
     found = []
     for i, j in itertools.product(range(3), repeat=2):
         r = minus(b[j], a[i])

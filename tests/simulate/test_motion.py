@@ -54,8 +54,7 @@ def test_motion_refuses(wrong):
 
 
 def test_quaternions_of_all_rotations():
-    rng = np.random.default_rng(0)
-    q = rng.normal(size=(200, 4))
+    q = np.random.default_rng(0).normal(size=(200, 4))
     q = np.concatenate([q, np.eye(4), [[1, 1, 0, 0], [0, 1, 1, 1e-12], [1e-9, 1, 0, 1]]])
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     expected = [quaternion_matrix(np.roll(row, 1))[:3, :3] for row in q]
