@@ -64,3 +64,12 @@ def ask(device, placed, pairs=((0, 1),), output="any", **options):
     for model, pose, solid in placed:
         scene.add(model, pose, solid=solid)
     return scene.intersect(np.array(pairs), output, **options)
+
+
+def moved(x=0.0, y=0.0, z=0.0):
+    return (x, y, z, 0, 0, 0, 1)
+
+
+def turned(faces, chosen):
+    """Return faces of which those chosen are wound the other way."""
+    return np.where(np.asarray(chosen)[:, None], faces[:, ::-1], faces)

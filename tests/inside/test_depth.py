@@ -5,20 +5,20 @@ import pytest
 import trimesh
 import warp as wp
 from helpers import refused
+from helpers.questions import captured
 from helpers.samples import random_poses
-from helpers.solids import ask, lattice_pose, model_of, shell, voxel_mesh
+from helpers.scenes import scene_with
+from helpers.solids import ask, lattice_pose, model_of, moved, shell, voxel_mesh
 from oracles.inside import parity
+from oracles.motion import posed
 from oracles.triangle import into_frame_of_a
 
 import warp_abtree as ab
 
 BOX = ab.Model.load(trimesh.creation.box((4, 4, 4)))
 BALL = ab.Model.load(trimesh.creation.icosphere(2, 0.5), base_faces=4)
+DEPTH = {"output": "distance", "signed": True}
 KNOT = ab.Model.load(trimesh.creation.torus(1, 0.45, major_sections=14, minor_sections=8), base_faces=4)
-
-
-def moved(x=0.0, y=0.0, z=0.0):
-    return (x, y, z, 0, 0, 0, 1)
 
 
 def samples(triangles):
@@ -29,7 +29,7 @@ def samples(triangles):
 
 
 def brute_depth(inner, outer):
-    """Greatest depth of samples of one surface in the other: 0 where there are none."""
+    """Greatest depth of samples of one surface in the other: 0 where there are none, or all lie on it."""
     points, _ = samples(inner)
     near = ((points >= outer.min((0, 1))) & (points <= outer.max((0, 1)))).all(1)
     points = np.unique(points[near], axis=0)
@@ -37,7 +37,7 @@ def brute_depth(inner, outer):
     for point in points:
         found = trimesh.triangles.closest_point(outer, np.tile(point, (len(outer), 1)))
         depth = np.linalg.norm(found - point, axis=1).min()
-        if depth > deepest + 1e-14 and parity(point, outer):
+        if depth > max(deepest + 1e-14, 1e-12) and parity(point, outer):
             deepest = depth
     return deepest
 
@@ -45,9 +45,9 @@ def brute_depth(inner, outer):
 def check_row(result, row, meshes, poses, solid, tolerance=1e-12):
     """Compare one pair that intersects with brute force, and its witnesses with the meshes; return the depth."""
     a, b = sorted(result.pairs[row].tolist())
-    posed = into_frame_of_a(meshes[b][0], poses[a], poses[b])[meshes[b][1]]
+    other = into_frame_of_a(meshes[b][0], poses[a], poses[b])[meshes[b][1]]
     own = meshes[a][0][meshes[a][1]]
-    expected = max(brute_depth(own, posed) if solid[b] else 0.0, brute_depth(posed, own) if solid[a] else 0.0)
+    expected = max(brute_depth(own, other) if solid[b] else 0.0, brute_depth(other, own) if solid[a] else 0.0)
     depth = -result.distance[row]
     assert abs(depth - expected) <= tolerance
     if depth > 0:
@@ -56,12 +56,8 @@ def check_row(result, row, meshes, poses, solid, tolerance=1e-12):
         gap = result.points[row, 0] - result.points[row, 1]
         assert abs(np.linalg.norm(gap) - depth) < 1e-12
         for k, which in enumerate(result.pairs[row]):
-            matrix = np.eye(4)
-            matrix[:3, :3] = trimesh.transformations.quaternion_matrix(np.roll(poses[which][3:], 1))[:3, :3]
-            matrix[:3, 3] = poses[which][:3]
             vertices, faces, ids = meshes[which]
-            face = vertices[faces[np.flatnonzero(ids == result.point_faces[row, k])[0]]]
-            face = face @ matrix[:3, :3].T + matrix[:3, 3]
+            face = posed(vertices[faces[np.flatnonzero(ids == result.point_faces[row, k])[0]]], poses[which])
             near = trimesh.triangles.closest_point(face[None], result.points[row, k][None])
             assert np.linalg.norm(near - result.points[row, k]) < 1e-12
     return depth
@@ -94,47 +90,41 @@ def test_closed_forms(device):
     """A ball sinks into a floor past whole rings of faces; a peg too thick for its hole; bodies of equal size."""
     for solid in (False, True):
         for sink in (1e-6, 0.1, 0.5, 0.9, 1.4):
-            found = ask(
-                device, [(BOX, moved(), True), (BALL, moved(z=2.5 - sink), solid)], output="distance", signed=True
-            )
+            found = ask(device, [(BOX, moved(), True), (BALL, moved(z=2.5 - sink), solid)], **DEPTH)
             assert found.distance[0] == pytest.approx(-sink, rel=1e-9)
             way = found.points[0, 0] - found.points[0, 1]
             np.testing.assert_allclose(way / np.linalg.norm(way), [0, 0, 1], atol=1e-6)
     peg = trimesh.creation.cylinder(1.01, 4, sections=64)
     plate = trimesh.creation.annulus(0.99, 2, 1, sections=64)
     peg, plate = ab.Model.load(peg), ab.Model.load(plate)
-    found = ask(device, [(peg, moved(), True), (plate, moved(), True)], output="distance", signed=True)
+    found = ask(device, [(peg, moved(), True), (plate, moved(), True)], **DEPTH)
     assert -0.021 < found.distance[0] < -0.019
     # Laid on one another, side on side, with all corners on the other's sides.
     for z, expected in ((3.9, -0.1), (4.0, 0.0), (4.5, 0.5)):
-        found = ask(device, [(BOX, moved(), True), (BOX, moved(z=z), True)], output="distance", signed=True)
+        found = ask(device, [(BOX, moved(), True), (BOX, moved(z=z), True)], **DEPTH)
         assert found.distance[0] == pytest.approx(expected, abs=1e-12)
     # Coincident: every sample lies on the other surface.
-    assert ask(device, [(BOX, moved(), True), (BOX, moved(), True)], output="distance", signed=True).distance[0] == 0
+    assert ask(device, [(BOX, moved(), True), (BOX, moved(), True)], **DEPTH).distance[0] == 0
 
 
 def test_a_single_face(device):
     sheet = ab.Model.from_arrays([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    for placed in (
-        [(BOX, moved(), True), (sheet, moved(1.5), False)],
-        [(sheet, moved(1.5), False), (BOX, moved(), True)],
-    ):
-        assert ask(device, placed, output="distance", signed=True).distance[0] == pytest.approx(-0.5, abs=1e-12)
+    both = [(BOX, moved(), True), (sheet, moved(1.5), False)]
+    for placed in (both, both[::-1]):
+        assert ask(device, placed, **DEPTH).distance[0] == pytest.approx(-0.5, abs=1e-12)
 
 
 def test_in_a_cavity_distances_stay_positive(device):
     hollow = model_of(voxel_mesh(shell(5)), "hollow")
-    found = ask(device, [(hollow, moved(), True), (BALL, moved(2.5, 2.5, 2.5), True)], output="distance", signed=True)
+    found = ask(device, [(hollow, moved(), True), (BALL, moved(2.5, 2.5, 2.5), True)], **DEPTH)
     assert 0.99 < found.distance[0] < 1.01
-    found = ask(device, [(hollow, moved(), True), (BALL, moved(2.5, 2.5, 1.0), True)], output="distance", signed=True)
+    found = ask(device, [(hollow, moved(), True), (BALL, moved(2.5, 2.5, 1.0), True)], **DEPTH)
     assert found.distance[0] < -0.4
 
 
 def test_the_same_bits_in_any_order_and_batch(device):
     rng = np.random.default_rng(7)
-    scene = ab.Scene(device)
-    for i, pose in enumerate(random_poses(rng, 10, 0.8)):
-        scene.add((KNOT, BALL)[i % 2], pose, solid=True)
+    scene = scene_with(device, *zip((KNOT, BALL) * 5, random_poses(rng, 10, 0.8)), solid=True)
     pairs = np.array([(i, j) for i in range(10) for j in range(i)])
     first = scene.intersect(pairs, "distance", signed=True)
     order = rng.permutation(len(pairs))
@@ -156,26 +146,14 @@ def test_lattice_bodies(device):
         bodies = [voxel_mesh(rng.integers(0, 3, (8, 3)), rng) for _ in range(2)]
         poses = lattice_pose(rng, 1), lattice_pose(rng, 1)
         models = [model_of((vertices * (1, 0.5)[k], faces)) for k, (vertices, faces) in enumerate(bodies)]
-        found = ask(device, list(zip(models, poses, (True, True))), output="distance", signed=True)
+        found = ask(device, list(zip(models, poses, (True, True))), **DEPTH)
         if found.any[0]:
             meshes = [model.mesh_at(model.lod_max)[:2] for model in models]
             own, other = meshes[0][0][meshes[0][1]], into_frame_of_a(meshes[1][0], *poses)[meshes[1][1]]
-            expected = max(brute_lattice(own, other), brute_lattice(other, own))
+            expected = max(brute_depth(own, other), brute_depth(other, own))
             assert -found.distance[0] == pytest.approx(expected, abs=1e-12)
             deep += expected > 0
     assert deep > 2
-
-
-def brute_lattice(inner, outer):
-    """As `brute_depth`, samples on the surface being none."""
-    deepest = 0.0
-    for point in np.unique(samples(inner)[0], axis=0):
-        depth = np.linalg.norm(
-            trimesh.triangles.closest_point(outer, np.tile(point, (len(outer), 1))) - point, axis=1
-        ).min()
-        if depth > 1e-12 and parity(point, outer):
-            deepest = max(deepest, depth)
-    return deepest
 
 
 def test_sweeps_and_captured_queries(device):
@@ -189,15 +167,12 @@ def test_sweeps_and_captured_queries(device):
     refused(ValueError, "signed means nothing", ab.sweep, BOX, BALL, poses, output="any", device=device, signed=True)
     if device != "cpu" and not wp.is_mempool_enabled(device):
         return
-    scene = ab.Scene(device)
-    scene.add(BOX, solid=True)
-    scene.add(BALL, poses[0], solid=True)
+    scene = scene_with(device, BOX, (BALL, poses[0]), solid=True)
     query = ab.DistanceQuery(scene, np.array([(0, 1)]), signed=True)
-    with wp.ScopedCapture(device) as capture:
-        query.launch()
+    replay = captured(query)
     for k, pose in enumerate(poses):
         scene.set_poses(np.array([moved(), pose]))
-        wp.capture_launch(capture.graph)
+        replay()
         assert query.result().distance[0] == found["distance"][k]
 
 
@@ -215,9 +190,7 @@ def test_depths_of_surfaces_are_refused(device, pairs):
     """Three surfaces, beside which a solid stands or does not."""
     given = None if pairs is None else np.array(pairs, np.int32).reshape(-1, 2)
     for with_solid in (False, True):
-        scene = ab.Scene(device)
-        for x in (0.0, 1.0, 1.5):
-            scene.add(BALL, moved(x))
+        scene = scene_with(device, *[(BALL, moved(x)) for x in (0.0, 1.0, 1.5)])
         scene.add(BOX, moved(50.0), solid=with_solid)
         # Of no pair at all nothing is wrong; nor of what the broad phase happens to find in a scene with a solid.
         fine = with_solid and not pairs
@@ -237,10 +210,9 @@ def test_depths_of_surfaces_are_refused(device, pairs):
 @pytest.mark.parametrize("count", [0, 3])
 def test_depths_of_surfaces_in_sweeps_are_refused(device, count):
     poses = np.array([moved(0.5)] * 3)[:count]
-    with pytest.raises(ValueError, match=r"^signed: no object of the pairs is a solid"):
-        ab.sweep(BALL, BOX, poses, output="distance", device=device, signed=True)
+    refused(ValueError, r"^signed: no object of the pairs", ab.sweep, BALL, BOX, poses, device=device, **DEPTH)
     for solid in ((True, False), (False, True)):
-        assert len(ab.sweep(BALL, BOX, poses, output="distance", device=device, signed=True, solid=solid)) == count
+        assert len(ab.sweep(BALL, BOX, poses, device=device, solid=solid, **DEPTH)) == count
 
 
 def test_depths_after_the_broad_phase_found_surfaces_alone(device):

@@ -5,8 +5,9 @@ import pytest
 import trimesh
 from helpers.bodies import about, model_of
 from helpers.samples import random_poses
+from helpers.scenes import scene_with
 from oracles.inside import parity
-from oracles.triangle import quaternion_matrix
+from oracles.motion import posed
 
 import warp_abtree as ab
 
@@ -18,17 +19,14 @@ SMALL = model_of(trimesh.creation.icosphere(1, 0.2))
 
 def points_of(device, placed, solid=True, **options):
     """Return the contact points of (model, pose) in a scene, and the result."""
-    scene = ab.Scene(device)
-    for model, pose in placed:
-        scene.add(model, pose=pose, solid=solid)
-    result = ab.ManifoldQuery(scene, pairs=[(0, 1)], **options).run()
+    result = ab.ManifoldQuery(scene_with(device, *placed, solid=solid), pairs=[(0, 1)], **options).run()
     return result.points, result
 
 
-def posed(model, pose):
+def triangles_of(model, pose):
     """Return the corners of the faces in the world, (n, 3, 3)."""
     vertices, faces, _ = model.mesh_at(model.lod_max)
-    return (vertices @ quaternion_matrix(np.asarray(pose)[3:]).T + np.asarray(pose)[:3])[faces]
+    return posed(vertices, np.asarray(pose))[faces]
 
 
 def depth_in(point, triangles):
@@ -58,7 +56,7 @@ def test_a_pair_is_as_deep_as_its_deepest_corner(device, models):
         if not result.any[0]:
             continue
         assert len(points["pair"]) <= 8
-        sides = [posed(*placed) for placed in zip(models, poses)]
+        sides = [triangles_of(*placed) for placed in zip(models, poses)]
         deepest = max(greatest_depth(*sides), greatest_depth(*sides[::-1]))
         known = {tuple(x) for x in plain["point"].tolist()}
         for x, normal, depth in zip(*(points[name] for name in ("point", "normal", "depth"))):
@@ -81,7 +79,7 @@ def test_a_ring_that_has_gone_under_is_as_deep_as_it_is(device, order):
     """Whole rings of faces are under the surface; without solids depth is that of the faces that cross."""
     for sink in (0.15, 0.2, 0.3):
         placed = [(BOX, (0, 0, -1, 0, 0, 0, 1)), (RING, (0.1, 0.2, 0.25 - sink, *about((0, 0, 1), 0.1)))]
-        low = -posed(*placed[1])[..., 2].min()
+        low = -triangles_of(*placed[1])[..., 2].min()
         points, _ = points_of(device, [placed[k] for k in order])
         plain, _ = points_of(device, [placed[k] for k in order], solid=False)
         assert points["depth"].max() == pytest.approx(low, abs=1e-12)
@@ -98,11 +96,10 @@ def test_what_lies_inside_whole_has_points_that_push_it_out_one_way(device, orde
     points, result = points_of(device, [placed[k] for k in order])
     assert result.any[0] and result.count[0] == 0
     assert 1 <= len(points["pair"]) <= 4
-    np.testing.assert_allclose(
-        points["normal"], [[0, 0, 1 if order == (0, 1) else -1]] * len(points["pair"]), atol=1e-9
-    )
+    up = 1 if order == (0, 1) else -1
+    np.testing.assert_allclose(points["normal"], [[0, 0, up]] * len(points["pair"]), atol=1e-9)
     np.testing.assert_allclose(points["depth"], -points["point"][:, 2], atol=1e-12)
-    assert points["depth"].max() == pytest.approx(-posed(*placed[1])[..., 2].min(), abs=1e-12)
+    assert points["depth"].max() == pytest.approx(-triangles_of(*placed[1])[..., 2].min(), abs=1e-12)
     assert not points_of(device, placed, solid=False)[0]["pair"].size
 
 
@@ -117,11 +114,9 @@ def test_solids_whose_contacts_know_their_depth_keep_their_points(device):
 
 def test_bodies_that_are_deep_in_a_solid_come_out(device):
     for model, z in ((SMALL, -0.8), (RING, 0.0)):
-        scene = ab.Scene(device)
-        scene.add(BOX, pose=(0, 0, -1, 0, 0, 0, 1), static=True, solid=True)
-        scene.add(model, pose=(0, 0, z, 0, 0, 0, 1))
-        bodies = ab.Dynamics(scene)
+        ground = (BOX, (0, 0, -1, 0, 0, 0, 1), {"static": True, "solid": True})
+        bodies = ab.Dynamics(scene_with(device, ground, (model, (0, 0, z, 0, 0, 0, 1))))
         for _ in range(60):
             bodies.step(1 / 60)
-        low = posed(model, bodies.poses()[1])[..., 2].min()
+        low = triangles_of(model, bodies.poses()[1])[..., 2].min()
         assert abs(low) < 0.005 and abs(bodies.velocities()[0][1, 2]) < 0.1

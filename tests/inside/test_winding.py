@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 from helpers import refused
-from helpers.solids import model_of, shell, voxel_mesh
+from helpers.scenes import scene_with
+from helpers.solids import model_of, turned, voxel_mesh
+from helpers.viewer import write_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,10 +25,6 @@ TORUS = trimesh.creation.torus(1, 0.3, major_sections=12, minor_sections=8)
 def winding_of(vertices, faces):
     mesh = mesh_from_arrays(vertices, faces)
     return find_winding(mesh.vertices, mesh.faces, mesh.dropped_faces)
-
-
-def turned(faces, chosen):
-    return np.where(np.asarray(chosen)[:, None], faces[:, ::-1], faces)
 
 
 @settings(max_examples=200, deadline=None)
@@ -70,43 +68,6 @@ def test_volumes_that_nearly_vanish_have_the_exact_sign():
         top = box.vertices[:, 2] > 0
         vertices[top, 2] = np.nextafter(1.0, 2.0 if direction > 0 else 0.0)
         assert (winding_of(vertices, box.faces).fault() is None) == (direction > 0)
-
-
-def test_walls_of_cavities_may_face_inwards():
-    vertices, faces = voxel_mesh(shell(3))  # a cube within a cube, which faces inwards
-    winding = winding_of(vertices, faces)
-    assert winding.fault() is None and len(np.unique(winding.part)) == 2
-    # Inside out as a whole, the outer wall is wrong, and the inner one an island of its own.
-    outer = winding.part == winding.part[np.argmax((vertices[faces] == 0).all(1).any(1))]
-    found = winding_of(vertices, turned(faces, outer))
-    assert np.array_equal(found.inside_out, np.flatnonzero(outer))
-    assert f"{outer.sum()} faces" in found.fault()
-    # Two bodies side by side are each for themselves, also where they share an edge.
-    for other in ((5, 0, 0), (1, 1, 0)):
-        vertices, faces = voxel_mesh([(0, 0, 0), other])
-        second = (vertices[faces][..., :2] >= np.minimum(other[:2], 1)).all((1, 2)) & (vertices[faces].max((1, 2)) > 1)
-        found = winding_of(vertices, turned(faces, second))
-        assert np.array_equal(found.inside_out, np.flatnonzero(second))
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_mending_restores_what_was_turned(seed):
-    rng = np.random.default_rng(seed)
-    cells = rng.integers(0, 4, (12, 3))
-    for vertices, faces in ((TORUS.vertices, TORUS.faces), voxel_mesh(cells, rng), voxel_mesh(shell(4), rng)):
-        for chosen in (rng.random(len(faces)) < 0.4, np.full(len(faces), True)):
-            mended = orient_mesh(mesh_from_arrays(vertices, turned(faces, chosen)))
-            sorted_faces = np.sort(mended.faces, axis=1)
-            assert np.array_equal(sorted_faces, np.sort(mesh_from_arrays(vertices, faces).faces, axis=1)), "same ids"
-            winding = find_winding(mended.vertices, mended.faces)
-            assert winding.fault() is None
-            before = winding_of(vertices, faces)
-            same = (np.roll(mended.faces, 0) == before.faces).all(1)
-            for shift in (1, 2):
-                same |= (np.roll(mended.faces, shift, axis=1) == before.faces).all(1)
-            for part in np.unique(before.part):
-                # A wall within another may face either way.
-                assert same[before.part == part].all() or not same[before.part == part].any()
 
 
 def test_open_and_one_sided_parts():
@@ -153,12 +114,10 @@ def test_every_lod_of_a_closed_mesh_is_closed():
 def test_open_solids_are_refused_by_their_edges(device):
     torn = ab.Model.from_arrays(TORUS.vertices, TORUS.faces[1:], name="torn")
     scene = ab.Scene(device)
-    with pytest.raises(
-        ab.MeshError, match=r"'torn' is no solid.*3 edges belong to an odd number of faces: \("
-    ) as found:
-        scene.add(torn, solid=True)
+    told = r"'torn' is no solid.*3 edges belong to an odd number of faces: \("
+    found = refused(ab.MeshError, told, scene.add, torn, solid=True)
     corner = ", ".join(f"{x:.6g}" for x in TORUS.vertices[TORUS.faces[0][0]])
-    assert f"({corner})" in str(found.value) and scene.object_count == 0
+    assert f"({corner})" in str(found) and scene.object_count == 0
     refused(ValueError, "solid 1 is neither", scene.add, torn, solid=1)
     refused(ab.MeshError, "torn", ab.sweep, torn, torn, np.eye(4)[None], solid=True, device=device)
     # Three sheets that share an edge leave none open, and still have no inside.
@@ -170,19 +129,15 @@ def test_open_solids_are_refused_by_their_edges(device):
 
 def test_wrong_winding_warns_once_where_it_matters(device):
     inverted = ab.Model.from_arrays(TORUS.vertices, TORUS.faces[:, ::-1], name="inverted")
-    scene = ab.Scene(device)
-    for _ in range(2):
-        scene.add(inverted, solid=True)
+    scene = scene_with(device, inverted, inverted, solid=True)
     scene.intersect(np.array([(0, 1)]), "faces")  # does not depend on it
     with pytest.warns(RuntimeWarning, match="'inverted': it is inside out; .*normals.*orient=True"):
         scene.intersect(np.array([(0, 1)]), "contacts")
     scene.add(inverted)
     scene.intersect(np.array([(0, 1)]), "contacts")
     other = ab.Model.from_arrays(TORUS.vertices, turned(TORUS.faces, np.arange(len(TORUS.faces)) < 9), name="mixed")
-    scene = ab.Scene(device)
-    scene.add(other)
     with pytest.warns(RuntimeWarning, match="'mixed': neighbouring faces disagree .* mass"):
-        ab.Dynamics(scene)
+        ab.Dynamics(scene_with(device, other))
 
 
 def test_orient_in_models_files_and_commands(tmp_path, capsys, monkeypatch):
@@ -201,22 +156,14 @@ def test_orient_in_models_files_and_commands(tmp_path, capsys, monkeypatch):
     capsys.readouterr()
     main(["info", "ball.npz", "--json"])
     found = json.loads(capsys.readouterr().out)
-    assert (found["closed"], found["winding"], found["mixed_edges"], found["inside_out_faces"]) == (
-        True,
-        "outwards",
-        0,
-        0,
-    )
-    (tmp_path / "a.toml").write_text(
-        '[models.b]\nmesh = "ball.obj"\norient = true\n[[objects]]\nmodel = "b"\nsolid = true\n', encoding="utf-8"
-    )
-    loaded = load_scene(tmp_path / "a.toml", device="cpu")
+    assert found["closed"] is True and found["winding"] == "outwards"
+    assert found["mixed_edges"] == found["inside_out_faces"] == 0
+    text = '[models.b]\nmesh = "ball.obj"\norient = true\n[[objects]]\nmodel = "b"\nsolid = true\n'
+    loaded = load_scene(write_scene(tmp_path, text), device="cpu")
     assert loaded.scene.object_solid == [True] and loaded.models["b"].winding.fault() is None
     trimesh.Trimesh(ball.vertices, ball.faces[1:]).export("torn.obj")
-    text = '[models.t]\nmesh = "torn.obj"\n[[objects]]\nmodel = "t"\nsolid = true\n'
-    (tmp_path / "b.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(SceneError, match=r"objects\[0\].solid: .* is no solid.*edges belong"):
-        load_scene(tmp_path / "b.toml", device="cpu")
+    torn = write_scene(tmp_path, text.replace("ball.obj", "torn.obj"))
+    refused(SceneError, r"objects\[0\].solid: .* is no solid.*edges belong", load_scene, torn, device="cpu")
 
 
 def test_the_mass_of_a_mended_body_is_its_own():

@@ -4,20 +4,16 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-import warp as wp
 from helpers import refused
-from helpers.motions import ANSWERS, STILL, find, random_motions, to_bytes
-from helpers.questions import pairs_of, scene_of
-from helpers.samples import random_poses, random_quaternions, sample
+from helpers.motions import ANSWERS, STILL, find, pose_matrices, random_motions, starts_of, to_bytes
+from helpers.questions import captured, in_a_row, pairs_of, scene_of
+from helpers.samples import grid, random_poses, random_quaternions, sample
+from helpers.scenes import scene_with
 from oracles.motion import apart_until, pose_between, rigid_soups, translation_contact
 
 import warp_abtree as ab
 from warp_abtree import testing
 from warp_abtree.kernels.motion import group
-
-
-def starts_of(cases):
-    return np.array([pose for case in cases for pose in (case[2], case[5])])
 
 
 def poses_at(cases, ends, times):
@@ -95,12 +91,8 @@ def test_translations_against_fractions(device, far):
 def test_thin_obstacles_are_not_passed(device, name):
     """A bullet through a sheet, however fast and far."""
     rng = np.random.default_rng(4)
-    sheet = ab.Model.from_arrays(
-        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]], [[0, 1, 2], [0, 2, 3]], base_faces=2
-    )
-    bullet = sample(name)
-    scene, ends, far = ab.Scene(device), [], 2.0 ** rng.integers(2, 12, 30)
-    scene.add(sheet)
+    sheet = ab.Model.from_arrays(grid(1)[0] * 2 - [1, 1, 0], grid(1)[1], base_faces=2)
+    bullet, scene, ends, far = sample(name), scene_with(device, sheet), [], 2.0 ** rng.integers(2, 12, 30)
     for way in far:
         scene.add(bullet, (*rng.uniform(-0.1, 0.1, 2), -way, *random_quaternions(rng, 1)[0]))
         ends.append([*rng.uniform(-0.1, 0.1, 2), 3 * way, *random_quaternions(rng, 1)[0]])
@@ -123,12 +115,13 @@ def test_order_of_objects_and_of_pairs_changes_nothing(device):
         np.testing.assert_array_equal(getattr(mixed, name), getattr(first, name)[order])
 
 
-def test_regimes_agree(device):
+@pytest.mark.parametrize("linear", [False, True])
+def test_regimes_agree(device, linear):
     cases, ends = random_motions(np.random.default_rng(6), 40, faces=500)
-    first = to_bytes(find(device, cases, ends))
+    first = to_bytes(find(device, cases, ends, linear=linear))
     for warps, length in ((True, None), (True, 129), (None, 200)):
         with testing.regime(warps=warps, stack_length=length, cpu_threads=1 if length else 2):
-            assert to_bytes(find(device, cases, ends)) == first
+            assert to_bytes(find(device, cases, ends, linear=linear)) == first
 
 
 def test_warps_that_take_a_group_of_pairs_agree(device):
@@ -165,13 +158,11 @@ def test_screws_end_where_they_should_and_keep_their_distance_from_the_axis(devi
     """A ball on a screw about z, beside a post there: touches if and only if it is as near as that."""
     post, ball = sample("one"), sample("small ball")
     reach = np.linalg.norm(ball.mesh_at(ball.lod_max)[0], axis=1).max()
-    scene, ends = ab.Scene(device), [STILL]
     vertices = post.mesh_at(post.lod_max)[0]
     middle = vertices.mean(0)
-    scene.add(post, (*-middle, 0, 0, 0, 1))
     radius = np.linalg.norm(vertices - middle, axis=1).max() + 1.05 * reach
     half = np.deg2rad(80)
-    scene.add(ball, (radius, 0, -0.1, 0, 0, 0, 1))
+    scene = scene_with(device, (post, (*-middle, 0, 0, 0, 1)), (ball, (radius, 0, -0.1, 0, 0, 0, 1)))
     ends = [
         [*-middle, 0, 0, 0, 1],
         [radius * np.cos(2 * half), radius * np.sin(2 * half), 0.1, 0, 0, np.sin(half), np.cos(half)],
@@ -197,15 +188,9 @@ def test_common_motions_are_clear(device):
     scene = scene_of(device, cases)
     met = scene.intersect(pairs_of(cases)).any
 
-    def matrices(poses):
-        turns = np.array([wp.quat_to_matrix(wp.quat(*q)) for q in poses[:, 3:]]).reshape(-1, 3, 3)
-        made = np.tile(np.eye(4), (len(poses), 1, 1))
-        made[:, :3, :3], made[:, :3, 3] = turns, poses[:, :3]
-        return made
-
-    starts = matrices(starts_of(cases))
+    starts = pose_matrices(starts_of(cases))
     scene.set_poses(starts)
-    ends = np.repeat(matrices(whole), 2, 0) @ starts
+    ends = np.repeat(pose_matrices(whole), 2, 0) @ starts
     result = scene.first_contact(pairs_of(cases), ends, screw=True)
     near = scene.intersect(pairs_of(cases), "distance").distance < 1e-3
     np.testing.assert_array_equal(result.clear[~near], ~met[~near])
@@ -247,22 +232,19 @@ def test_captured_graphs(device):
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     query = ab.FirstContactQuery(scene, ends, pairs)
     first = query.run()
-    with wp.ScopedCapture(query.device) as capture:
-        query.launch()
+    replay = captured(query)
     query.set_end_poses(starts_of(cases))
-    wp.capture_launch(capture.graph)
+    replay()
     assert query.result().clear[first.time > 0].all()
     query.set_end_poses(ends)
-    wp.capture_launch(capture.graph)
+    replay()
     assert to_bytes(query.result()) == to_bytes(first)
     on_device = query.result(device=True)
     assert [getattr(on_device, name).numpy().tobytes() for name in ANSWERS] == to_bytes(first)
 
 
 def test_bad_input(device):
-    scene = ab.Scene(device)
-    for x in (0, 3):
-        scene.add(sample("box"), (x, 0, 0, 0, 0, 0, 1))
+    scene = in_a_row(device, "box", (0, 3))
     ends = np.array([STILL, STILL])
     for tolerance in (0, 1, -1, np.nan, "a", 2.0**-41, [1e-6]):
         refused(ValueError, "tolerance", scene.first_contact, [(0, 1)], ends, tolerance=tolerance)
@@ -275,8 +257,7 @@ def test_bad_input(device):
         (np.array([STILL, [0, 0, 0, 0, 1, 0, 1e-8]]), "half a revolution"),
     ):
         refused(ValueError, message, scene.first_contact, [(0, 1)], bad)
-    with pytest.raises(ValueError):
-        scene.first_contact([(0, 2)], ends)
+    refused(ValueError, "", scene.first_contact, [(0, 2)], ends)
     assert scene.first_contact([(0, 1)], np.array([STILL, [3, 0, 0, 0, 0, 1, 1e-5]])).clear.all()
     assert len(scene.first_contact(np.empty((0, 2), int), ends).time) == 0
 
@@ -289,10 +270,7 @@ def test_sweeps(device, path):
     starts, ends = (random_poses(rng, 1500, 3.0) for _ in range(2))
     options = {"output": "first_contact", "tolerance": 1e-3, "lod_a": a.lod_for(fraction=0.1), "device": device, **path}
     rows = ab.sweep(a, b, starts, end_poses=ends, **options)
-    scene = ab.Scene(device)
-    scene.add(a, lod=options["lod_a"])
-    for pose in starts[:100]:
-        scene.add(b, pose)
+    scene = scene_with(device, (a, STILL, {"lod": options["lod_a"]}), *[(b, pose) for pose in starts[:100]])
     pairs = np.stack([np.zeros(100, int), np.arange(1, 101)], 1)
     result = scene.first_contact(pairs, [STILL, *ends[:100]], tolerance=1e-3, **path)
     for name in ANSWERS:

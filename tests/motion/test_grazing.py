@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import trimesh
+from helpers.scenes import scene_with
 from oracles.straight import Motion
 from oracles.triangle import triangles_intersect
 
@@ -14,7 +15,7 @@ from warp_abtree import testing
 
 KINDS = ("vertex-face", "edge-edge")
 FACE = [(0, 0, 0), (4, 0, 0), (0, 4, 0)]
-ACROSS = [(0, 0, 0), (4, 0, 0), (2, -2, 0), (2, 2, 0)]
+ACROSS, LINE = [(0, 0, 0), (4, 0, 0), (2, -2, 0), (2, 2, 0)], [(0, 0, 0), (1, 0, 0), (3, 0, 0), (4, 0, 0)]
 
 
 def moved(points, *ways):
@@ -23,35 +24,22 @@ def moved(points, *ways):
     return points, [tuple(np.add(p, w)) for p, w in zip(points, ways)]
 
 
+VERTEX, EDGES = KINDS
+ROD = [(0, 0, 1), (2, 0, 1)]
+# Features, their corners and ways, and whether they meet.
 KNOWN = {
-    "through a face": ("vertex-face", moved([(1, 1, 1), *FACE], (0, 0, -2), (0, 0, 0)), True),
-    "beside it": ("vertex-face", moved([(3, 3, 1), *FACE], (0, 0, -2), (0, 0, 0)), False),
-    "onto it at last": ("vertex-face", moved([(1, 1, 1), *FACE], (0, 0, -1), (0, 0, 0)), True),
-    "not quite": ("vertex-face", moved([(1, 1, 1), *FACE], (0, 0, -0.99), (0, 0, 0)), False),
-    "in its plane, past a corner": ("vertex-face", moved([(-2, -1, 0), *FACE], (4, -2, 0), (0, 0, 0)), False),
-    "in its plane, over a corner": ("vertex-face", moved([(-1, 1, 0), *FACE], (2, -2, 0), (0, 0, 0)), True),
-    "onto a face that becomes a line": (
-        "vertex-face",
-        moved([(1, 1, 0), *FACE], (0, 0, 0), (0, 0, 0), (0, 0, 0), (4, -4, 0)),
-        True,
-    ),
-    "one edge over the other": ("edge-edge", moved([*ACROSS[:2], (2, -2, 1), (2, 2, 1)], (0, 0, 2), (0, 0, 0)), True),
-    "along the other's line": ("edge-edge", moved([(0, 0, 0), (1, 0, 0), (3, 0, 0), (4, 0, 0)], (1, 0, 0)), False),
-    "onto its end": (
-        "edge-edge",
-        moved([(0, 0, 0), (1, 0, 0), (3, 0, 0), (4, 0, 0)], (2, 0, 0), (2, 0, 0), (0, 0, 0)),
-        True,
-    ),
-    "parallel, over": (
-        "edge-edge",
-        moved([(0, 0, 1), (2, 0, 1), (1, 0, 0), (4, 0, 0)], (0, 0, -2), (0, 0, -2), (0, 0, 0)),
-        True,
-    ),
-    "parallel, past the end": (
-        "edge-edge",
-        moved([(0, 0, 1), (2, 0, 1), (3, 0, 0), (4, 0, 0)], (0, 0, -2), (0, 0, -2), (0, 0, 0)),
-        False,
-    ),
+    "through a face": (VERTEX, moved([(1, 1, 1), *FACE], (0, 0, -2), (0, 0, 0)), True),
+    "beside it": (VERTEX, moved([(3, 3, 1), *FACE], (0, 0, -2), (0, 0, 0)), False),
+    "onto it at last": (VERTEX, moved([(1, 1, 1), *FACE], (0, 0, -1), (0, 0, 0)), True),
+    "not quite": (VERTEX, moved([(1, 1, 1), *FACE], (0, 0, -0.99), (0, 0, 0)), False),
+    "in its plane, past a corner": (VERTEX, moved([(-2, -1, 0), *FACE], (4, -2, 0), (0, 0, 0)), False),
+    "in its plane, over a corner": (VERTEX, moved([(-1, 1, 0), *FACE], (2, -2, 0), (0, 0, 0)), True),
+    "onto a face that becomes a line": (VERTEX, moved([(1, 1, 0), *FACE], *[(0, 0, 0)] * 3, (4, -4, 0)), True),
+    "one edge over the other": (EDGES, moved([*ACROSS[:2], (2, -2, 1), (2, 2, 1)], (0, 0, 2), (0, 0, 0)), True),
+    "along the other's line": (EDGES, moved(LINE, (1, 0, 0)), False),
+    "onto its end": (EDGES, moved(LINE, (2, 0, 0), (2, 0, 0), (0, 0, 0)), True),
+    "parallel, over": (EDGES, moved([*ROD, (1, 0, 0), (4, 0, 0)], *[(0, 0, -2)] * 2, (0, 0, 0)), True),
+    "parallel, past the end": (EDGES, moved([*ROD, *LINE[2:]], *[(0, 0, -2)] * 2, (0, 0, 0)), False),
 }
 
 
@@ -166,9 +154,7 @@ def test_posed_meshes_come_as_near(gap, clear, way, device):
     first = np.array([0, 0, 1.0 if way == "comes down" else gap])
     last = np.array([0.375, 0.5, gap])
     for turn, end_turn, axes in (((0, 0, 0, 1), (0, 0, 0.6, 0.8), [0, 1, 2]), ((0.5,) * 4, (0.5,) * 4, [2, 0, 1])):
-        scene = ab.Scene(device)
-        scene.add(base, (0, 0, 0, *turn))
-        scene.add(top, (*first[axes], *turn))
+        scene = scene_with(device, (base, (0, 0, 0, *turn)), (top, (*first[axes], *turn)))
         ends = np.array([(0, 0, 0, *turn), (*last[axes], *end_turn)])
         result = scene.first_contact([(0, 1)], ends, linear=True)
         assert result.clear[0] == clear and not result.undecided[0]

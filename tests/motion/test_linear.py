@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 from helpers import refused
-from helpers.motions import STILL, find, random_motions, to_bytes
-from helpers.samples import sample
+from helpers.motions import STILL, find, random_motions
+from helpers.questions import in_a_row
 from oracles.motion import apart_until, straight_soups
 from oracles.triangle import box_pairs, pairs_intersect
 
-import warp_abtree as ab
 from bench.motions.ccd_queries import FOLDER, read_queries
 from warp_abtree import testing
 
@@ -37,13 +36,6 @@ def test_never_late_and_early_by_the_tolerance(device):
             assert soups_intersect(*place(min(time + TOLERANCE, 1.0) if time > 0 else 0.0))
 
 
-def test_regimes_agree(device):
-    cases, ends = random_motions(np.random.default_rng(2), 30, faces=500)
-    first = to_bytes(find(device, cases, ends, linear=True))
-    with testing.regime(warps=True):
-        assert to_bytes(find(device, cases, ends, linear=True)) == first
-
-
 def test_without_turns_it_is_the_rigid_motion(device):
     cases, ends = random_motions(np.random.default_rng(3), 30)
     for case, path in zip(cases, ends.reshape(-1, 2, 7)):
@@ -54,9 +46,7 @@ def test_without_turns_it_is_the_rigid_motion(device):
 
 
 def test_half_revolutions_have_straight_ways(device):
-    scene = ab.Scene(device)
-    scene.add(sample("box"))
-    scene.add(sample("box"), (8, 0, 0, 0, 0, 0, 1))
+    scene = in_a_row(device, "box", (0, 8))
     ends = [STILL, [8, 0, 0, 0, 0, 1, 0]]
     assert scene.first_contact([(0, 1)], ends, linear=True).clear.all()
     refused(ValueError, "one kind of path", scene.first_contact, [(0, 1)], ends, linear=True, screw=True)

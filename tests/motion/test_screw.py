@@ -1,7 +1,8 @@
 """Motions on screws: flat patches that pass one another closely, against dense exact tests."""
 
 import numpy as np
-from helpers.motions import find
+import pytest
+from helpers.motions import find, starts_of
 from helpers.questions import pairs_of, scene_of
 from helpers.samples import random_poses
 from oracles.motion import pose_between
@@ -19,11 +20,8 @@ def random_patch(rng, pitch):
     tilt = Rotation.from_rotvec([0, rng.uniform(-1, 1), rng.uniform(-0.3, 0.3)])
     if rng.random() < 0.5:
         tilt = Rotation.from_rotvec([np.arctan(pitch), 0, 0]) * Rotation.from_rotvec([0, rng.uniform(0.8, 1.7), 0])
-    points = tilt.apply(np.stack([0 * u, u, v], 1)) + [
-        rng.uniform(0.95, 1.05),
-        0,
-        rng.uniform(-0.05, 0.05) * rng.choice([0.1, 1]),
-    ]
+    place = [rng.uniform(0.95, 1.05), 0, rng.uniform(-0.05, 0.05) * rng.choice([0.1, 1])]
+    points = tilt.apply(np.stack([0 * u, u, v], 1)) + place
     return ab.Model.from_arrays(points, [[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]], base_faces=4)
 
 
@@ -46,21 +44,15 @@ def sliding_motions(rng, drift):
     return cases, np.array(ends)
 
 
-def check(device, drift, seed):
+@pytest.mark.parametrize(("drift", "seed"), [(0.0, 1), (0.03, 2)])
+def test_patches_on_a_screw_are_never_late(device, drift, seed):
+    """Also where they drift across the axis."""
     cases, ends = sliding_motions(np.random.default_rng(seed), drift)
     result = find(device, cases, ends)
     scene, pairs = scene_of(device, cases), pairs_of(cases)
-    starts = np.array([pose for case in cases for pose in (case[2], case[5])])
+    starts = starts_of(cases)
     assert not result.undecided.any() and 10 < result.clear.sum() < COUNT - 10
     for part in np.linspace(0, 1, TIMES):
         times = np.repeat(part * result.time, 2)
         scene.set_poses(np.array([pose_between(*row) for row in zip(starts, ends, times)]))
         assert not scene.intersect(pairs).any[result.time > 0].any(), part
-
-
-def test_patches_on_a_screw_are_never_late(device):
-    check(device, 0.0, 1)
-
-
-def test_patches_that_drift_across_the_axis_are_never_late(device):
-    check(device, 0.03, 2)
