@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from helpers.scenes import scene_with
 from helpers.viewer import run_command as run
 
 import warp_abtree as ab
@@ -86,9 +87,7 @@ def test_query_against_the_library(files, capsys):
     asked = ("ball.obj", "ring.ply", "--pose", *ASIDE, "--lod-a", 0.25, "--lod-b", "900", "--output", "faces")
     found = answer(capsys, *asked)
     ball, ring = ab.Model.load("ball.obj"), ab.Model.load("ring.ply")
-    scene = ab.Scene(device="cpu")
-    scene.add(ball, lod=ball.lod_for(fraction=0.25))
-    scene.add(ring, pose=ASIDE, lod=900)
+    scene = scene_with("cpu", (ball, {"lod": ball.lod_for(fraction=0.25)}), (ring, ASIDE, {"lod": 900}))
     expected = scene.intersect(np.array([[0, 1]]), output="faces")
     assert found["faces"] == expected.faces[:, 1:].tolist()
     assert found["count"] == expected.count[0] and found["intersects"] is True
@@ -137,9 +136,7 @@ def test_query_against_the_library(files, capsys):
 @pytest.mark.slow
 def test_contacts_against_the_library(files, capsys, device, precision, b, pose):
     a = "ball.obj" if b == "ring.ply" else b
-    scene = ab.Scene(device)
-    scene.add(ab.Model.load(a))
-    scene.add(ab.Model.load(b), pose=pose)
+    scene = scene_with(device, ab.Model.load(a), (ab.Model.load(b), pose))
     expected = scene.intersect(np.array([[0, 1]]), output="contacts", precision=precision)
     words = (a, b, "--pose", *pose, "--output", "contacts", "--precision", precision)
     found = answer(capsys, *words, "--record", "rows.csv", device=device)

@@ -8,6 +8,7 @@ import warp as wp
 
 import warp_abtree as ab
 from helpers.samples import SHAPES, contact_poses, sample
+from helpers.scenes import scene_with
 from warp_abtree import testing
 
 SIGNS = itertools.product((1.0, -1.0), repeat=3)
@@ -60,9 +61,7 @@ def ask(device, cases, **options):
 
 def in_a_row(device, name, places):
     """Return a scene of copies of a sample at places along x."""
-    scene = ab.Scene(device)
-    for x in places:
-        scene.add(sample(name), (x, 0, 0, 0, 0, 0, 1))
+    scene = scene_with(device, *[(sample(name), (x, 0, 0, 0, 0, 0, 1)) for x in places])
     return scene
 
 
@@ -94,10 +93,10 @@ def coarse(name, faces=500):
     return model.mesh_at(model.lod_for(fraction=min(1.0, faces / model.face_count)))[:2]
 
 
-def captured(operator):
+def captured(operator, *arguments):
     """Capture a launch of an operator; return a function that replays it."""
     with wp.ScopedCapture(operator.device) as capture:
-        operator.launch()
+        operator.launch(*arguments)
     return lambda: wp.capture_launch(capture.graph)
 
 

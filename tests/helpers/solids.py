@@ -3,6 +3,7 @@
 import numpy as np
 
 import warp_abtree as ab
+from helpers.scenes import scene_with
 
 # The two triangles of a unit square's sides, by corners of the cube in binary, outwards.
 SQUARES = {
@@ -60,9 +61,7 @@ def model_of(mesh, name="voxels"):
 
 def ask(device, placed, pairs=((0, 1),), output="any", **options):
     """Return the result for objects given as (model, pose, whether it is a solid)."""
-    scene = ab.Scene(device)
-    for model, pose, solid in placed:
-        scene.add(model, pose, solid=solid)
+    scene = scene_with(device, *[(model, pose, {"solid": solid}) for model, pose, solid in placed])
     return scene.intersect(np.array(pairs), output, **options)
 
 

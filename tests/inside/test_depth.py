@@ -66,9 +66,7 @@ def check_row(result, row, meshes, poses, solid, tolerance=1e-12):
 @pytest.mark.parametrize("seed", range(3))
 def test_depths_are_those_of_brute_force(device, seed):
     rng = np.random.default_rng(seed)
-    scene = ab.Scene(device)
-    for i in range(8):
-        scene.add((KNOT, BALL)[i % 2], moved(), solid=i % 4 != 3)
+    scene = scene_with(device, *[((KNOT, BALL)[i % 2], moved(), {"solid": i % 4 != 3}) for i in range(8)])
     pairs = np.array([(i, j) for i in range(8) for j in range(i)])
     pairs[::2] = pairs[::2, ::-1]
     deep = 0

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 import warp as wp
 from helpers import refused
+from helpers.bodies import at, collided, contact_rows, newton_mesh, settle
 
 import warp_abtree as ab
 
@@ -22,51 +23,28 @@ PART = trimesh.Trimesh(
 NEAR = newton.ModelBuilder.ShapeConfig(gap=0.02, margin=0.0)
 
 
-def mesh_of(vertices, faces):
-    return newton.Mesh(np.asarray(vertices, np.float32), np.asarray(faces, np.int32).ravel())
-
-
-def at(x=0.0, y=0.0, z=0.0):
-    return wp.transform((x, y, z), wp.quat_identity())
-
-
 def points_of(model, **options):
     """Return shapes, normals and points of the contacts of a model at its poses."""
-    found = ab.NewtonContacts(model, **options)
-    contacts = found.contacts()
-    found.collide(model.state(), contacts)
-    count = int(contacts.rigid_contact_count.numpy()[0])
-    names = ("shape0", "shape1", "normal", "point0", "point1")
-    return [getattr(contacts, f"rigid_contact_{name}").numpy()[:count] for name in names]
+    return contact_rows(collided(model, **options)[2], "shape0", "shape1", "normal", "point0", "point1")
 
 
 def scene_of(device, scale, mirrored_by_hand, on_body, solids):
     builder = newton.ModelBuilder()
-    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=mesh_of(FLOOR.vertices, FLOOR.faces), cfg=NEAR)
-    vertices, faces, given = PART.vertices, PART.faces, scale
+    faces, low = PART.faces, float((PART.vertices * scale)[:, 2].min())
+    mesh, place = newton_mesh(PART), at(0.2, 0.1, (-0.4 if solids else -0.01) - low)
+    given = wp.vec3(*map(float, scale))
     if mirrored_by_hand:
-        faces = faces[:, ::-1] if np.prod(scale) < 0 else faces
-        vertices, given = vertices * scale, (1, 1, 1)
-    low = float((PART.vertices * scale)[:, 2].min())
-    place = at(0.2, 0.1, (-0.4 if solids else -0.01) - low)
+        faces, given = faces[:, ::-1] if np.prod(scale) < 0 else faces, wp.vec3(1.0, 1.0, 1.0)
+        mesh = newton_mesh(trimesh.Trimesh(PART.vertices * scale, faces, process=False))
+    # Two that are static never meet: either moves.
+    floor = -1 if on_body else builder.add_body(xform=at(z=-0.5))
+    builder.add_shape_mesh(floor, xform=at(z=-0.5) if on_body else at(), mesh=newton_mesh(FLOOR), cfg=NEAR)
     body = builder.add_body(xform=place) if on_body else -1
-    shape = builder.add_shape_mesh(
-        body,
-        xform=at() if on_body else place,
-        mesh=mesh_of(vertices, faces),
-        scale=wp.vec3(*map(float, given)),
-        cfg=NEAR,
-    )
-    # The same mesh, not mirrored, far from the others: it shares no model with the mirrored one.
-    builder.add_shape_mesh(builder.add_body(xform=at(x=9)), mesh=mesh_of(vertices, faces), cfg=NEAR)
-    if not on_body:
-        # Two that are static never meet: the floor moves.
-        builder = newton.ModelBuilder()
-        builder.add_shape_mesh(builder.add_body(xform=at(z=-0.5)), mesh=mesh_of(FLOOR.vertices, FLOOR.faces), cfg=NEAR)
-        builder.add_shape_mesh(
-            -1, xform=place, mesh=mesh_of(vertices, faces), scale=wp.vec3(*map(float, given)), cfg=NEAR
-        )
-    return builder.finalize(device=device), shape
+    builder.add_shape_mesh(body, xform=at() if on_body else place, mesh=mesh, scale=given, cfg=NEAR)
+    if on_body:
+        # The same mesh, not mirrored, far from the others: it shares no model with the mirrored one.
+        builder.add_shape_mesh(builder.add_body(xform=at(x=9)), mesh=mesh, cfg=NEAR)
+    return builder.finalize(device=device)
 
 
 @pytest.mark.parametrize("solids", [False, True])
@@ -74,7 +52,7 @@ def scene_of(device, scale, mirrored_by_hand, on_body, solids):
 def test_mirrored_shapes_are_those_mirrored_by_hand(device, on_body, solids):
     for scale in itertools.product((1.0, -2.0), (1.0, -0.5), (1.0, -1.0)):
         found, expected = (
-            points_of(scene_of(device, np.array(scale), by_hand, on_body, solids)[0], solids=solids)
+            points_of(scene_of(device, np.array(scale), by_hand, on_body, solids), solids=solids)
             for by_hand in (False, True)
         )
         assert len(found[0]) > 0
@@ -85,36 +63,25 @@ def test_mirrored_shapes_are_those_mirrored_by_hand(device, on_body, solids):
         assert (up > 0.5).all(), scale
 
 
-def settle(model, pipeline, steps):
-    state, after, control = model.state(), model.state(), model.control()
-    contacts = pipeline.contacts()
-    solver = newton.solvers.SolverXPBD(model, iterations=10)
-    for _ in range(steps):
-        state.clear_forces()
-        pipeline.collide(state, contacts)
-        solver.step(state, after, control, contacts, 1 / 240)
-        state, after = after, state
-    return state.body_q.numpy()
-
-
 def test_mirrored_shapes_rest_where_newton_has_them(device):
     """A mirrored ball on a mirrored floor, beside Newton's own contacts."""
     ball = trimesh.creation.icosphere(1, radius=0.3)
     low = float(ball.vertices[:, 2].min())
     builder = newton.ModelBuilder()
-    floor = mesh_of(FLOOR.vertices, FLOOR.faces)
+    floor = newton_mesh(FLOOR)
     builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=floor, scale=wp.vec3(1.0, -1.0, 1.0), cfg=NEAR)
     body = builder.add_body(xform=at(z=-low))
-    builder.add_shape_mesh(body, mesh=mesh_of(ball.vertices, ball.faces), scale=wp.vec3(-1.0, -1.0, -1.0), cfg=NEAR)
+    builder.add_shape_mesh(body, mesh=newton_mesh(ball), scale=wp.vec3(-1.0, -1.0, -1.0), cfg=NEAR)
     model = builder.finalize(device=device)
-    ours, newtons = (settle(model, make(model), 40) for make in (ab.NewtonContacts, newton.CollisionPipeline))
+    finders = ab.NewtonContacts(model), newton.CollisionPipeline(model)
+    ours, newtons = (settle(model, found, 40, iterations=10)[0] for found in finders)
     assert ours[0, 2] == pytest.approx(newtons[0, 2], abs=0.003) == pytest.approx(-low, abs=0.003)
 
 
 def stack(device):
     """Return a model of a mesh floor, two mesh bodies on it, and a sphere."""
     builder = newton.ModelBuilder()
-    floor, part = mesh_of(FLOOR.vertices, FLOOR.faces), mesh_of(PART.vertices, PART.faces)
+    floor, part = newton_mesh(FLOOR), newton_mesh(PART)
     builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=floor, cfg=NEAR)
     for x in (-1.0, 1.0):
         builder.add_shape_mesh(builder.add_body(xform=at(x=x, z=-0.01)), mesh=part, cfg=NEAR)
@@ -146,9 +113,7 @@ CHANGES = {
 @pytest.mark.parametrize("name", CHANGES)
 def test_what_is_read_once_is_refused_where_it_changed(device, name, captured):
     model = stack(device)
-    state, found = model.state(), ab.NewtonContacts(model)
-    contacts = found.contacts()
-    found.collide(state, contacts)
+    state, found, contacts = collided(model)
     if captured:
         if device != "cpu" and not wp.is_mempool_enabled(device):
             pytest.skip("no graph without a memory pool")
@@ -179,9 +144,7 @@ def test_what_is_read_once_is_refused_where_it_changed(device, name, captured):
 
 def test_other_meshes_and_filters_are_refused(device):
     model = stack(device)
-    state, found = model.state(), ab.NewtonContacts(model)
-    contacts = found.contacts()
-    found.collide(state, contacts)
+    state, found, contacts = collided(model)
     pairs = sorted(model.shape_collision_filter_pairs)
     for other in ([*pairs, (1, 3)], [*pairs, (1, 2)][1:], pairs):
         model._set_shape_collision_filter_pairs(other)
@@ -189,29 +152,26 @@ def test_other_meshes_and_filters_are_refused(device):
             found.collide(state, contacts)
             continue
         refused(RuntimeError, r"^shape_collision_filter_pairs changed", found.collide, state, contacts)
-    model.shape_source[1] = mesh_of(2 * PART.vertices, PART.faces)
+    model.shape_source[1] = newton_mesh(trimesh.Trimesh(2 * PART.vertices, PART.faces))
     refused(RuntimeError, r"^shape_source changed", found.collide, state, contacts)
 
 
 def test_what_is_read_at_every_call_may_change(device):
     """Transforms of shapes, whether one is drawn, and the sizes of shapes that are no meshes."""
     model = stack(device)
-    state, found = model.state(), ab.NewtonContacts(model)
-    contacts = found.contacts()
-    found.collide(state, contacts)
-    before = int(contacts.rigid_contact_count.numpy()[0])
+    state, found, contacts = collided(model)
+    before = len(contact_rows(contacts, "normal")[0])
     change(model, "shape_flags", 2, int(model.shape_flags.numpy()[2]) ^ int(newton.ShapeFlags.VISIBLE))
     change(model, "shape_scale", 3, (0.2, 0.0, 0.0))
     change(model, "shape_transform", 1, (0.0, 0.0, 5.0, 0.0, 0.0, 0.0, 1.0))
     found.collide(state, contacts)
-    assert 0 < int(contacts.rigid_contact_count.numpy()[0]) < before
-    touched = contacts.rigid_contact_shape1.numpy()[: int(contacts.rigid_contact_count.numpy()[0])]
-    assert 1 not in touched and 2 in touched
+    (touched,) = contact_rows(contacts, "shape1")
+    assert 0 < len(touched) < before and 1 not in touched and 2 in touched
 
 
 @pytest.mark.parametrize("solids", [[True, False, True, False], np.array([True]), [0.5], "all"])
 def test_solids_are_indices(device, solids):
     """A mask is no list of indices: it would make solids of shapes 0 and 1."""
-    with pytest.raises(ValueError, match=r"^solids: .* is neither a bool nor indices of shapes$"):
-        ab.NewtonContacts(stack(device), solids=solids)
+    said = r"^solids: .* is neither a bool nor indices of shapes$"
+    refused(ValueError, said, ab.NewtonContacts, stack(device), solids=solids)
     assert not any(ab.NewtonContacts(stack(device), solids=[]).scene.object_solid)

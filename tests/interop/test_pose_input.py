@@ -8,17 +8,15 @@ import trimesh
 import warp as wp
 from helpers import refused
 from helpers.samples import random_poses
+from helpers.scenes import scene_with
 
 import warp_abtree as ab
 
 
 @pytest.fixture
 def scene(device):
-    scene = ab.Scene(device)
     ring = ab.Model.load(trimesh.creation.torus(0.6, 0.2, 16, 8))
-    for k in range(6):
-        scene.add(ring, pose=(0.3 * k, 0, 0, 0, 0, 0, 1))
-    return scene
+    return scene_with(device, *[(ring, (0.3 * k, 0, 0, 0, 0, 0, 1)) for k in range(6)])
 
 
 def poses_of(seed, count=6):
@@ -27,9 +25,7 @@ def poses_of(seed, count=6):
 
 def expected(scene, poses):
     """Answers of another scene, whose poses go through the host."""
-    other = ab.Scene(scene.device)
-    for pose in poses:
-        other.add(scene.models[0], pose=pose)
+    other = scene_with(scene.device, *[(scene.models[0], pose) for pose in poses])
     return other.intersect(other.broad_phase(), output="count")
 
 

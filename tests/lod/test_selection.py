@@ -7,8 +7,8 @@ import pytest
 import warp as wp
 from helpers import refused
 from helpers.bodies import selection_models, strewn
+from helpers.scenes import scene_with
 
-import warp_abtree as ab
 from warp_abtree.lod.controllers import Feedback, PaperController, PredictiveController, ToleranceController
 from warp_abtree.lod.view import Camera
 from warp_abtree.state.ladder import Ladder
@@ -77,9 +77,7 @@ def run_paper(scene, costs, start=0.0, focus=None, **options):
 
 
 def test_figure_4(device):
-    scene = ab.Scene(device=device)
-    for importance in (1, 2, 3):
-        scene.add(selection_models()[0], importance=importance)
+    scene = scene_with(device, *[(selection_models()[0], {"importance": importance}) for importance in (1, 2, 3)])
     # Room on both sides, so that no end of the ladder hides a step.
     levels, _ = run_paper(scene, [5.0] * 5 + [15.0] * 5, steps=400, start=200.0)
     moved = np.diff(levels, axis=0).T

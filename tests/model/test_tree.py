@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from helpers import refused
 from helpers.samples import plain, raw_state, repeated, sample, soup
+from helpers.scenes import scene_with
 from hypothesis import HealthCheck, given, settings
 from oracles import abtree as oracle
 
@@ -163,8 +164,7 @@ def test_walks_over_soups(device, first, second, walk):
 @pytest.mark.parametrize("name", ["one", "crumbs", "soup", "lattice soup"])
 def test_tree_state_shows_the_state(device, name):
     model = sample(name)
-    scene = ab.Scene(device)
-    scene.add(model, lod=0)
+    scene = scene_with(device, model, lod=0)
     for lod in (0, model.lod_max // 2, model.lod_max):
         scene.set_lods([lod])
         raw, shown = raw_state(scene, 0), scene.tree_state(0)
@@ -193,9 +193,7 @@ def test_tree_state_shows_the_state(device, name):
 
 def test_objects_share_states(device):
     model, other = sample("small ball"), sample("crumbs")
-    scene = ab.Scene(device)
-    for m in (model, other, model, model):
-        scene.add(m)
+    scene = scene_with(device, model, other, model, model)
     states, objects = scene.batch().states, scene.batch().objects
     assert objects.state[0] == objects.state[2] == objects.state[3] != objects.state[1]
     assert len(states.slots) == 2

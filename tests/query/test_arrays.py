@@ -7,7 +7,7 @@ from helpers import refused
 from helpers.faults import describe
 from helpers.questions import to_matrix
 from helpers.samples import STILL, random_poses, sample
-from helpers.scenes import add_objects
+from helpers.scenes import add_objects, scene_with
 from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
@@ -94,9 +94,7 @@ def test_poses(device, framework, shape, real, monkeypatch):
         expected = getattr(first.batch().objects.pool, name).numpy()
         assert getattr(second.batch().objects.pool, name).numpy().tobytes() == expected.tobytes()
     model, many = sample("torus"), poses_of(shape, real, 500)
-    scene = ab.Scene(device)
-    for pose in (STILL, *many):
-        scene.add(model, pose)
+    scene = scene_with(device, *[(model, pose) for pose in (STILL, *many)])
     expected = scene.intersect([(0, i + 1) for i in range(500)], output="faces")
     assert expected.any.any()
     for output in ("count", "faces"):

@@ -8,6 +8,7 @@ import warp as wp
 from conftest import slow
 from helpers.questions import GpuQuery, ask, in_a_row, launch, pairs_of, random_case, scene_of, sort_rows
 from helpers.samples import REAL_MESHES, STILL, WARP_MESHES, contact_poses, random_poses, sample, true_faces
+from helpers.scenes import scene_with
 from oracles.peers import fcl_faces, judge
 from oracles.triangle import into_frame_of_a
 
@@ -79,9 +80,7 @@ def test_relative_poses_equal_the_definition(device):
     points = rng.normal(size=(50, 3)) * 2.0 ** rng.integers(-30, 5, (50, 3))
     points[:2] = (0, 0, 0), (2.0**-291, -(2.0**-300), 2.0**-290)
     poses[:2] = STILL
-    scene = ab.Scene(device)
-    for pose in poses:
-        scene.add(sample("box"), pose)
+    scene = scene_with(device, *[(sample("box"), pose) for pose in poses])
     pairs = np.concatenate([np.arange(60).reshape(-1, 2), rng.permutation(60).reshape(-1, 2)])
     query = ab.Query(scene, "any", pairs=pairs, precision="exact")
     query.launch()
@@ -215,9 +214,7 @@ def test_small_and_large_trees_by_turns(device):
 def test_coincident_meshes_go_to_float64_at_once(device):
     """Of twins in one place all faces, of a copy's those that float32 leaves open: the answers are the same."""
     model, pose = sample("soup"), random_poses(np.random.default_rng(12), 1, 1.0)[0]
-    scene = ab.Scene(device)
-    for placed in (model, model, copy.copy(model)):
-        scene.add(placed, pose)
+    scene = scene_with(device, *[(placed, pose) for placed in (model, model, copy.copy(model))])
     result = scene.intersect([(0, 1), (0, 2)], "faces")
     first, second = (result.faces[result.faces[:, 0] == p, 1:] for p in range(2))
     np.testing.assert_array_equal(first, second)

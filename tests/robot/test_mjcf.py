@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from helpers.robots import random_configurations
+from helpers.robots import pairs_of, random_configurations, tested_pairs
 
 import warp_abtree as ab
 
@@ -94,13 +94,11 @@ def test_links_meet_where_mujoco_has_contacts(name, tmp_path, device):
 
 def test_visual_geoms_leave_neighbours_out_unless_filterparent_is_disabled(tmp_path):
     def of(name):
-        robot = load(ARMS[name], tmp_path, "visual")
-        names = [robot.link_names[k] for k in robot.model_link]
-        return {frozenset((names[i], names[j])) for i, j in robot.pairs}
+        return tested_pairs(load(ARMS[name], tmp_path, "visual"))
 
-    joined = {frozenset(pair) for pair in (("base", "one"), ("world", "one"), ("two", "three"), ("one", "two"))}
+    joined = pairs_of("base one", "world one", "two three", "one two")
     assert not joined & of("plain") and joined <= of("parents") and of("parents") - of("plain") >= joined
-    assert of("neighbours") - of("plain") == {frozenset(p) for p in (("two", "three"), ("one", "two"), ("one", "tool"))}
+    assert of("neighbours") - of("plain") == pairs_of("two three", "one two", "one tool")
 
 
 def test_equalities_and_tendons_that_nothing_enforces_are_named(tmp_path):

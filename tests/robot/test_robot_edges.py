@@ -1,9 +1,11 @@
 """Edges of robots: the same bits alone and in any batch, against samples just before their times and dense ones."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import trimesh
-from helpers.robots import described_arm, described_chain, random_configurations
+from helpers.robots import AROUND, described_arm, described_chain, random_configurations
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -12,9 +14,6 @@ from warp_abtree.interop.robot import check, robot
 from warp_abtree.interop.robot.description import Part, RobotFrame
 from warp_abtree.model.mesh import mesh_from_arrays
 
-RING = ab.Model.load(trimesh.creation.torus(0.45, 0.12, 32, 12))
-ROOF = ab.Model.load(trimesh.creation.box((1.5, 0.1, 0.02)))
-AROUND = [(RING, (0, 0, 0.75, 0, 0, 0, 1)), (ROOF, (0, 0.3, 1.1, 0, 0, 0.6, 0.8))]
 WALL = ab.Model.load(trimesh.creation.box((0.1, 1, 1)))
 X, Y, Z, HERE = (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)
 CUBE = trimesh.creation.box((0.1, 0.1, 0.1))
@@ -23,8 +22,7 @@ CUBE = trimesh.creation.box((0.1, 0.1, 0.1))
 @pytest.fixture(scope="module")
 def arms():
     """Return the arm of a device, made once."""
-    made = {}
-    return lambda device: made.setdefault(device, ab.Robot(described_arm(), device, mounted=["base"]))
+    return cache(lambda device: ab.Robot(described_arm(), device, mounted=["base"]))
 
 
 def random_edges(count, seed, part=0.15):
@@ -119,9 +117,8 @@ def test_a_joint_that_mimics_backwards_meets_a_thin_wall(device, kind, scale):
     check_never_late(finger, wall, starts, ends, rows, 1e-3)
     # The corner that meets the wall first is at (1.05, 0.05) before the cube turns.
     height = 0.3707 - 5e-5
-    contact = (
-        height - 0.05 if kind == "prismatic" else np.arcsin(height / np.hypot(1.05, 0.05)) - np.arctan2(0.05, 1.05)
-    )
+    angle = np.arcsin(height / np.hypot(1.05, 0.05)) - np.arctan2(0.05, 1.05)
+    contact = height - 0.05 if kind == "prismatic" else angle
     assert not rows["clear"][0] and contact - 1e-3 <= rows["time"][0] <= contact
 
 

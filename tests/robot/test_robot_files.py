@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 from helpers import refused
-from helpers.robots import MJCF, URDF, random_configurations, write_arm
+from helpers.robots import MJCF, URDF, pairs_of, random_configurations, tested_pairs, write_arm
 
 import warp_abtree as ab
 
@@ -25,16 +25,6 @@ def urdf(tmp_path):
 def mjcf(tmp_path):
     pytest.importorskip("mujoco")
     return write_arm(tmp_path, MJCF, "arm.xml")
-
-
-def asked_pairs(robot):
-    """Return the pairs of names of links that are tested."""
-    names = [robot.link_names[k] for k in robot.model_link]
-    return {frozenset((names[i], names[j])) for i, j in robot.pairs}
-
-
-def pairs_of(*names):
-    return {frozenset(pair.split()) for pair in names}
 
 
 def test_urdf_poses_are_those_of_yourdfpy(urdf, device):
@@ -75,12 +65,12 @@ def test_urdf_meshes_pairs_and_srdf(urdf, tmp_path):
     np.testing.assert_allclose([upper.min(0), upper.max(0)], [[-0.05, -0.04, 0.05], [0.05, 0.15, 0.55]], atol=1e-12)
     # The flange is rigidly joined to the forearm, so that fingers are neighbours of this.
     fingers = pairs_of("base left", "base right", "upper left", "upper right", "left right")
-    assert asked_pairs(arm) == fingers | pairs_of("base fore")
+    assert tested_pairs(arm) == fingers | pairs_of("base fore")
     assert [arm.link_names[k] for k in ab.Robot.load(urdf, "visual", device="cpu").model_link] == ["upper"]
     (tmp_path / "arm.srdf").write_text(SRDF.format("base"), encoding="utf-8")
-    assert asked_pairs(ab.Robot.load(urdf, device="cpu", srdf=tmp_path / "arm.srdf")) == fingers
+    assert tested_pairs(ab.Robot.load(urdf, device="cpu", srdf=tmp_path / "arm.srdf")) == fingers
     neutral = ab.Robot.load(urdf, device="cpu", neutral=[0, 0, 0.0])
-    assert asked_pairs(neutral) == asked_pairs(arm) - pairs_of("left right")
+    assert tested_pairs(neutral) == tested_pairs(arm) - pairs_of("left right")
 
 
 def test_mjcf_meshes_and_pairs(mjcf):
@@ -91,9 +81,9 @@ def test_mjcf_meshes_and_pairs(mjcf):
     names = [arm.link_names[k] for k in arm.model_link]
     assert names == ["base", "upper", "fore", "left", "left", "right"] and not (arm.pairs == 4).any()
     pairs = pairs_of("base left", "base right", "upper left", "upper right", "left right")
-    assert asked_pairs(arm) == pairs | pairs_of("base upper")  # the base stands still
+    assert tested_pairs(arm) == pairs | pairs_of("base upper")  # the base stands still
     visual = ab.Robot.load(mjcf, "visual", device="cpu")
-    assert asked_pairs(visual) == pairs
+    assert tested_pairs(visual) == pairs
     assert visual.models[1].face_count > arm.models[1].face_count
 
 
@@ -140,11 +130,7 @@ def test_a_limit_that_urdf_leaves_out_is_zero(urdf):
         ('lower="-2.8"', 'lower="nan"', "joint 'bend': limits nan .. 2.8 leave no value"),
         (BEND_LIMIT, "", "joint 'bend' is revolute and has no limits; .*, or make it continuous$"),
         (BEND_LIMIT, '<limit effort="1" velocity="1"/>', "joint 'bend' is revolute and has no limits"),
-        (
-            '<limit lower="0" upper="0.1" effort="1" velocity="1"/>',
-            "",
-            r"'grip' is prismatic and has no limits; .*\.\.>$",
-        ),
+        (GRIP_LIMIT, "", r"'grip' is prismatic and has no limits; .*\.\.>$"),
         ('size="0.08 0.08 0.5"', 'size="0.08 0.5"', "link 'upper': sizes .* are not 3"),
         ('radius="0.1" length', 'radius="-0.1" length', "link 'base': sizes .* are not 2"),
         ('radius="0.03"', 'radius="nan"', "link 'left': sizes .* are not 1"),
@@ -204,8 +190,8 @@ def test_formats_are_told_apart_and_a_geometry_without_meshes_is_named(urdf, mjc
     )
     mjcf.write_text('<mujoco><worldbody><geom size="1" contype="0" conaffinity="0"/></worldbody></mujoco>')
     for path in (urdf, mjcf):
-        with pytest.raises(ValueError, match=f"{path.name}: no link has a mesh of geometry='collision'; .* 'visual'"):
-            ab.Robot.load(path, device="cpu")
+        said = f"{path.name}: no link has a mesh of geometry='collision'; .* 'visual'"
+        refused(ValueError, said, ab.Robot.load, path, device="cpu")
         assert len(ab.Robot.load(path, "visual", device="cpu").models) == 1
 
 

@@ -11,7 +11,8 @@ import fcl
 import numpy as np
 import pytest
 import trimesh
-from helpers.robots import random_configurations
+from helpers.robots import pairs_of, random_configurations, tested_pairs
+from oracles.peers import fcl_object
 
 import warp_abtree as ab
 
@@ -77,7 +78,7 @@ class FilesInFcl:
             else:  # a box, unturned
                 mesh = trimesh.creation.box(2 * self.model.geom_size[g])
                 mesh.apply_translation(self.model.geom_pos[g])
-            self.geoms.append((int(self.model.geom_bodyid[g]), fcl.CollisionObject(fcl_tree(mesh), fcl.Transform())))
+            self.geoms.append((int(self.model.geom_bodyid[g]), fcl_object(mesh.vertices, mesh.faces)))
 
     def pose(self, values):
         """Pose the geoms for the values of joints by name."""
@@ -91,22 +92,14 @@ class FilesInFcl:
         return [geom for body, geom in self.geoms if self.model.body(body).name == name]
 
 
-def fcl_tree(mesh):
-    tree = fcl.BVHModel()
-    tree.beginModel(len(mesh.vertices), len(mesh.faces))
-    tree.addSubModel(mesh.vertices, mesh.faces)
-    tree.endModel()
-    return tree
-
-
 def check_originals(path, geometry, pairs, follower, base, count, device):
     """Compare with FCL at random configurations, alone and around a ring."""
     robot = ab.Robot.load(path, geometry, device, mounted=[base])
     names = [robot.link_names[k] for k in robot.model_link]
-    assert len(names) == len(set(names)) and {frozenset((names[i], names[j])) for i, j in robot.pairs} == pairs
+    assert len(names) == len(set(names)) and tested_pairs(robot) == pairs
     files, ring = FilesInFcl(path, geometry), trimesh.creation.torus(0.55, 0.15, 48, 16)
     ring.apply_translation((0, 0, 0.5))
-    around = fcl.CollisionObject(fcl_tree(ring), fcl.Transform())
+    around = fcl_object(ring.vertices, ring.faces)
     # Fingers that are closed touch exactly, which rounding decides.
     low, high = robot.limits.T
     rows = random_configurations(count, np.array([low + 1e-3 * (high - low), high]).T, seed=4)
@@ -123,9 +116,8 @@ def check_originals(path, geometry, pairs, follower, base, count, device):
 
 @pytest.mark.parametrize("geometry", ["visual", "collision"])
 def test_links_of_several_files(geometry, tmp_path, device):
-    pairs = {("base", "fore"), ("base", "left"), ("base", "right"), ("upper", "left"), ("upper", "right")}
-    pairs |= {("left", "right")}
-    check_originals(write_arm(tmp_path), geometry, set(map(frozenset, pairs)), "follow", "base", 200, device)
+    pairs = pairs_of("base fore", "base left", "base right", "upper left", "upper right", "left right")
+    check_originals(write_arm(tmp_path), geometry, pairs, "follow", "base", 200, device)
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 from helpers import refused
+from helpers.robots import pairs_of, tested_pairs
 
 import warp_abtree as ab
 
@@ -17,7 +18,7 @@ JOINT = (
 )
 ALL = {frozenset((a, b)) for a in LINKS for b in LINKS if a < b}
 # The last two links are fixed to one another: neighbours of neither are tested unless an SRDF says so.
-JOINED = {frozenset(pair.split()) for pair in ("l0 l1", "l1 l2", "l2 l3", "l3 l4", "l2 l4")}
+JOINED = pairs_of("l0 l1", "l1 l2", "l2 l3", "l3 l4", "l2 l4")
 
 
 @pytest.fixture
@@ -28,8 +29,7 @@ def load(tmp_path):
 
     def load(srdf, root="robot", **options):
         (tmp_path / "r.srdf").write_text(f'<{root} name="r">{srdf}</{root}>', encoding="utf-8")
-        robot = ab.Robot.load(tmp_path / "r.urdf", device="cpu", srdf=tmp_path / "r.srdf", **options)
-        return {frozenset(robot.link_names[robot.model_link[k]] for k in pair) for pair in robot.pairs}
+        return tested_pairs(ab.Robot.load(tmp_path / "r.urdf", device="cpu", srdf=tmp_path / "r.srdf", **options))
 
     return load
 
@@ -67,7 +67,7 @@ def test_pairs_are_those_of_moveit(load):
 
 def test_only_entries_of_the_robot_itself_count(load):
     assert load('<group name="g"><disable_collisions link1="l0" link2="l2"/></group>') == ALL - JOINED
-    assert load('<disable_collisions link1=" l0 " link2="l2"/>') == ALL - JOINED - {frozenset(("l0", "l2"))}
+    assert load('<disable_collisions link1=" l0 " link2="l2"/>') == ALL - JOINED - pairs_of("l0 l2")
 
 
 def test_links_that_the_robot_lacks_are_refused_or_named(load):
@@ -75,7 +75,7 @@ def test_links_that_the_robot_lacks_are_refused_or_named(load):
     entries += '<enable_collisions link1="mast" link2="l1"/><disable_default_collisions link="camera"/>'
     refused(ValueError, r"disable_default_collisions names 'camera', .* \(strict=False goes on\)", load, entries)
     with pytest.warns(RuntimeWarning, match=r"r.srdf: what is said of 'camera', 'mast' is left out") as caught:
-        assert load(entries, strict=False) == ALL - JOINED - {frozenset(("l0", "l2"))}
+        assert load(entries, strict=False) == ALL - JOINED - pairs_of("l0 l2")
     assert len(caught) == 1 and caught[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -128,6 +128,5 @@ def test_what_joints_do_not_place_is_named(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         refused(RuntimeWarning, "not enforced", load, tmp_path, "part.stl", rest=loops)
-        load(
-            tmp_path, "part.stl", rest='<gazebo reference="l"/><transmission name="t"><joint name="x"/></transmission>'
-        )
+        others = '<gazebo reference="l"/><transmission name="t"><joint name="x"/></transmission>'
+        load(tmp_path, "part.stl", rest=others)

@@ -5,7 +5,7 @@ import pytest
 from helpers import refused
 from helpers.questions import in_a_row, sort_rows, to_matrix
 from helpers.samples import STILL, random_poses, raw_state, sample, true_faces
-from helpers.scenes import TURN, add_objects, everything, pair_scene
+from helpers.scenes import TURN, add_objects, everything, pair_scene, scene_with
 from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
@@ -22,9 +22,7 @@ def test_quaternions_are_normalised_in_float64(device):
     poses = random_poses(np.random.default_rng(1), 3, 5.0)
     poses[:, 3:] *= [[1.0009], [0.9991], [1.0]]
     scene.set_poses(poses)
-    added = ab.Scene(device)
-    for pose in poses:
-        added.add(sample("box"), pose)
+    added = scene_with(device, *[(sample("box"), pose) for pose in poses])
     for found in (placed(scene), placed(added)):
         for pose, rotation, position in zip(poses, *found, strict=True):
             np.testing.assert_equal((rotation, position), pose_matrix(pose))
@@ -150,9 +148,7 @@ def test_names_of_a_model_may_repeat(device):
     """Models count by identity: two models of one name are two models."""
     vertices, faces, _ = sample("box").mesh_at(sample("box").lod_max)
     twins = [ab.Model.from_arrays(vertices * s, faces, name="same") for s in (1.0, 5.0)]
-    scene = ab.Scene(device)
-    for model in (*twins, twins[0]):
-        scene.add(model)
+    scene = scene_with(device, *twins, twins[0])
     assert len(scene.models) == 2 and scene.object_model == [0, 1, 0]
     assert scene.tree_state(1).upper[1][0] > 4 * scene.tree_state(0).upper[1][0]
 

@@ -12,6 +12,7 @@ import warp as wp
 from helpers import refused
 from helpers.questions import GpuQuery
 from helpers.samples import SHAPES, STILL, random_poses, sample
+from helpers.scenes import scene_with
 
 import warp_abtree as ab
 from warp_abtree.checks.device_lock import device_lock
@@ -33,8 +34,7 @@ def small_chunks(monkeypatch):
 
 def ask_scene(device, models, poses, lod_a=None, **options):
     """Return the faces of a scene with an object a pose."""
-    scene = ab.Scene(device)
-    scene.add(models[0], STILL, lod=lod_a)
+    scene = scene_with(device, (models[0], STILL), lod=lod_a)
     for pose in poses:
         scene.add(models[1], pose)
     return scene.intersect([(0, i + 1) for i in range(len(poses))], output="faces", **options)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from helpers.bodies import about, make, model_of, on_ground
+from helpers.bodies import about, make, model_of, on_ground, run
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
@@ -40,8 +40,7 @@ def test_a_box_that_falls_stops_at_the_surface(device, speed, turn):
 def test_fine_meshes_rest_a_few_slops_deep_at_60_steps_a_second(device, model, most):
     low = model.mesh_at(model.lod_max)[0][:, 2].min()
     dynamics = on_ground(device, (model, (0, 0, 0.3 - low, *about((0, 0, 1), 0.3))))
-    for _ in range(90):
-        dynamics.step(1 / 60)
+    run(dynamics, 90, 1 / 60)
     assert -0.1 < depth_in_floor(dynamics, model) < most
 
 
@@ -49,8 +48,7 @@ def test_bodies_that_fly_together_have_no_contacts(device):
     """Their reach is that of their relative motion, whatever the speed."""
     placed = [(BOX, (0.9 * k, 0, 0, 0, 0, 0, 1)) for k in range(3)]
     dynamics = make(device, *placed, velocity=(0, 0, 20.0), gravity=(0, 0, 0))
-    for _ in range(3):
-        dynamics.step(1 / 60)
+    run(dynamics, 3, 1 / 60)
     assert len(dynamics.query.result().points["pair"]) == 0
     np.testing.assert_allclose(dynamics.velocities()[0], [[0, 0, 20.0]] * 3)
 
@@ -58,8 +56,7 @@ def test_bodies_that_fly_together_have_no_contacts(device):
 def test_a_body_that_passes_by_is_not_touched(device):
     """Over a floor, not towards it: contacts ahead hold nothing that does not come nearer."""
     dynamics = on_ground(device, (BOX, (-2, 0, 0.205, 0, 0, 0, 1)), velocity=(6.0, 0, 0), gravity=(0, 0, 0))
-    for _ in range(30):
-        dynamics.step(1 / 60)
+    run(dynamics, 30, 1 / 60)
     np.testing.assert_allclose(dynamics.velocities()[0][1], [6.0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(dynamics.poses()[1, :3], [1.0, 0, 0.205], atol=1e-12)
 

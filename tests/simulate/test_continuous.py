@@ -5,7 +5,9 @@ import pytest
 import trimesh
 import warp as wp
 from helpers import refused
-from helpers.bodies import BRICK, TORUS, about, bits, box, make, model_of, on_ground
+from helpers.bodies import BRICK, TORUS, about, bits, box, make, model_of, on_ground, run
+from helpers.questions import captured
+from helpers.samples import STILL
 
 import warp_abtree as ab
 from warp_abtree.query.request import Buffers, CapacityError
@@ -99,8 +101,7 @@ def test_a_heap_falls_and_comes_to_rest_without_more_energy(device):
 
 def test_a_body_rests_about_a_slop_above_the_floor(device):
     dynamics = on_ground(device, (box(0.8, 0.6, 0.4), (0, 0, 0.5, *about((0, 0, 1), 0.3))), continuous=True)
-    for _ in range(60):
-        dynamics.step(1 / 60)
+    run(dynamics, 60, 1 / 60)
     slop = dynamics.bodies.bounding_radius.numpy()[1] / 512
     assert 0.2 + 0.4 * slop < dynamics.poses()[1, 2] < 0.2 + 1.6 * slop
     assert dynamics.certified.fraction.numpy()[1] == 1
@@ -117,13 +118,12 @@ def test_bodies_that_overlap_at_first_are_not_stopped(device):
 
 def test_a_kinematic_object_stops_too_and_catches_up(device):
     """It presses a brick on the floor, and is late for its target until it turns back."""
-    dynamics = on_ground(
-        device, (BRICK, (0, 0, 0.3, 0, 0, 0, 1)), (BRICK, (0, 0, 1.0, 0, 0, 0, 1)), kinematic=[2], continuous=True
-    )
+    bricks = [(BRICK, (0, 0, z, 0, 0, 0, 1)) for z in (0.3, 1.0)]
+    dynamics = on_ground(device, *bricks, kinematic=[2], continuous=True)
     for z in (0.9, 0.6, 0.4):
-        dynamics.step(1 / 60, [[0, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0, 1], [0, 0, z, 0, 0, 0, 1]])
+        dynamics.step(1 / 60, [STILL, STILL, [0, 0, z, 0, 0, 0, 1]])
     assert 0.75 < dynamics.poses()[2, 2] < 0.82 and not surfaces_meet(dynamics)
-    dynamics.step(1 / 60, [[0, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0, 1], [0, 0, 1.5, 0, 0, 0, 1]])
+    dynamics.step(1 / 60, [STILL, STILL, [0, 0, 1.5, 0, 0, 0, 1]])
     assert dynamics.poses()[2, 2] == 1.5
 
 
@@ -133,14 +133,12 @@ def test_steps_repeat_to_the_bit_and_in_a_captured_graph(device):
         return on_ground(device, *placed, velocity=(0, 0, -20.0), continuous=True, **options)
 
     first, second = thrown(), thrown()
-    for _ in range(12):
-        first.step(1 / 60)
+    run(first, 12, 1 / 60)
     if wp.get_device(device).is_cuda:
         second.step(1 / 60)
-        with wp.ScopedCapture(device) as capture:
-            second.launch(1 / 60)
+        replay = captured(second, 1 / 60)
         for _ in range(11):
-            wp.capture_launch(capture.graph)
+            replay()
     else:
         for _ in range(12):
             second.launch(1 / 60)

@@ -5,7 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
+from helpers import refused
 from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, TORUS, about, box, make, model_of, on_ground, run
+from helpers.samples import grid
 
 import warp_abtree as ab
 from warp_abtree.checks.quaternions import matrices_of
@@ -52,12 +54,11 @@ def test_an_open_mesh_has_the_mass_of_its_convex_hull(monkeypatch):
     mesh = trimesh.creation.box((1, 2, 3))
     for faces in (np.delete(mesh.faces, [0, 5], axis=0), mesh.faces[:, ::-1]):
         assert mass_properties(ab.Model.from_arrays(mesh.vertices, faces)).volume == pytest.approx(6.0)
-    with pytest.raises(ValueError, match="flat"):
-        mass_properties(ab.Model.from_arrays([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]], [[0, 1, 2], [0, 2, 3]]))
+    refused(ValueError, "flat", mass_properties, ab.Model.from_arrays(*grid(1)))
     missing = trimesh.exceptions.ExceptionWrapper(ModuleNotFoundError("No module named 'scipy'"))
     monkeypatch.setattr(trimesh.convex, "ConvexHull", missing)
-    with pytest.raises(ValueError, match="'open' is not closed: its convex hull needs scipy"):
-        mass_properties(ab.Model.from_arrays(mesh.vertices, mesh.faces[1:], name="open"))
+    model = ab.Model.from_arrays(mesh.vertices, mesh.faces[1:], name="open")
+    refused(ValueError, "'open' is not closed: its convex hull needs scipy", mass_properties, model)
 
 
 def tumble(moments, momentum, rotation, time, steps):
@@ -109,9 +110,8 @@ def test_free_collisions_keep_momentum_and_angular_momentum(device, seed, fricti
     rng = np.random.default_rng(seed)
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])[rng.permutation(8)[:6]]
     turns = rng.normal(size=(6, 4))
-    placed = [
-        (model, (*(1.1 * p), *(q / np.linalg.norm(q)))) for model, p, q in zip((BRICK, BALL, TORUS) * 2, corners, turns)
-    ]
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    placed = [(model, (*(1.1 * p), *q)) for model, p, q in zip((BRICK, BALL, TORUS) * 2, corners, turns)]
     before = -corners * rng.uniform(0.7, 1.0, (6, 1)) + rng.normal(0, 0.1, (6, 3))
     omega = rng.normal(size=(6, 3))
     dynamics = make(device, *placed, friction=friction, velocity=before, angular_velocity=omega, gravity=(0, 0, 0))
@@ -145,9 +145,8 @@ def test_cubes_face_to_face(device):
 def test_corrections_of_place_leave_velocity_and_energy(device):
     """A brick deep in the floor that leaves it slowly: it is lifted and rotated, but keeps its velocities."""
     pose = (0, 0, 0.4, *about((0.3, 1, 0), 0.5))
-    dynamics = on_ground(
-        device, (box(1.2, 0.9, 0.5), pose), velocity=(0, 0, 0.3), angular_velocity=(0, 0, 2), gravity=(0, 0, 0)
-    )
+    moving = {"velocity": (0, 0, 0.3), "angular_velocity": (0, 0, 2), "gravity": (0, 0, 0)}
+    dynamics = on_ground(device, (box(1.2, 0.9, 0.5), pose), **moving)
     start = totals(dynamics)
     dynamics.step(0.01)
     found = totals(dynamics)
