@@ -140,7 +140,7 @@ def random_configurations(count, limits=LIMITS, seed=0):
     return np.random.default_rng(seed).uniform(np.maximum(low, -20), np.minimum(high, 20), (count, len(limits)))
 
 
-def tested_pairs(robot):
+def asked_pairs(robot):
     """Return the pairs of names of links that are tested."""
     names = [robot.link_names[k] for k in robot.model_link]
     return {frozenset((names[i], names[j])) for i, j in robot.pairs}

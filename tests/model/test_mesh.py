@@ -146,10 +146,8 @@ BIG = np.broadcast_to(np.array([0, 1, 2], dtype=np.int32), (2**30 + 1, 3))
     ],
 )
 def test_array_errors(vertices, faces, message, recwarn):
-    with pytest.raises(MeshError, match=message) as caught:
-        mesh_from_arrays(vertices, faces, name="thing")
-    assert str(caught.value).startswith("thing: ")
-    assert "\n" not in str(caught.value)
+    caught = refused(MeshError, message, mesh_from_arrays, vertices, faces, name="thing")
+    assert str(caught).startswith("thing: ")
     assert not recwarn.list
 
 

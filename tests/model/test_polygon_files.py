@@ -256,9 +256,8 @@ def test_damaged_files(tmp_path, name, data, message):
         pytest.skip("cascadio is here")
     (tmp_path / name).write_bytes(data)
     for read in (load_mesh, lambda path: ab.scene_from_file(path, device="cpu"))[: 1 if name == "a.usda" else 2]:
-        with pytest.raises(ab.MeshError, match=message) as caught:
-            read(tmp_path / name)
-        assert str(caught.value).startswith(f"{tmp_path / name}: ") and "\n" not in str(caught.value)
+        caught = refused(ab.MeshError, message, read, tmp_path / name)
+        assert str(caught).startswith(f"{tmp_path / name}: ")
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,13 @@
 """Batched traversal: every intersecting face pair, against exact brute force and an independent library."""
 
 import copy
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import warp as wp
-from conftest import slow
+from conftest import ROOT, slow
 from helpers.questions import GpuQuery, ask, in_a_row, launch, pairs_of, random_case, scene_of, sort_rows
 from helpers.samples import REAL_MESHES, STILL, WARP_MESHES, contact_poses, random_poses, sample, true_faces
 from helpers.scenes import scene_with
@@ -239,3 +241,34 @@ def test_a_coarse_tree_costs_no_more_than_one_built_for_its_lod(device, name, fr
         theirs = ask(device, [(static, None, pose_a, static, None, pose_b) for pose_a, pose_b in poses], output="count")
     np.testing.assert_array_equal(ours.count, theirs.count)
     assert ours.node_tests.sum() <= 1.1 * theirs.node_tests.sum()
+
+
+POISONED = """
+import numpy as np
+import trimesh
+import warp as wp
+
+import warp_abtree as ab
+
+ball = trimesh.creation.icosphere(2)
+scene = ab.Scene("cpu")
+scene.add(ab.Model.from_arrays(ball.vertices, ball.faces))
+scene.add(ab.Model.from_arrays(np.array([[-99.0, -99, 0], [99, -99, 0], [0, 99, 0]]), [[0, 1, 2]]))
+states = scene.batch().states.pool
+nodes = states.node_box.numpy()
+poison = np.full((4096, 4), 2**29 + 12345, np.int32).view(np.float32)
+states.node_box = wp.array(np.concatenate([nodes, poison]), dtype=wp.vec4, device="cpu")
+query = ab.Query(scene, "faces", pairs=[(0, 1)])
+poses = np.tile(np.eye(4), (2, 1, 1))
+for z in np.linspace(-0.9, 0.9, 40):
+    poses[0, :3, 3] = z / 3, 0, z
+    scene.set_poses(poses)
+    assert query.run().any.all()
+"""
+
+
+@pytest.mark.slow
+def test_nothing_beyond_the_nodes_is_read():
+    """Beyond them lie records that lead far out of memory: a process of its own ends where it reads there."""
+    done = subprocess.run([sys.executable, "-c", POISONED], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr

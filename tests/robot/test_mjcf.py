@@ -1,10 +1,11 @@
-"""Pairs of MJCF files are those that MuJoCo makes contacts of, and what ties links beside their joints is named."""
+"""MJCF files: pairs that MuJoCo makes contacts of, what ties links beside joints, mirrored meshes and polygons."""
 
 import warnings
 
 import numpy as np
 import pytest
-from helpers.robots import pairs_of, random_configurations, tested_pairs
+import trimesh
+from helpers.robots import asked_pairs, pairs_of, random_configurations
 
 import warp_abtree as ab
 
@@ -94,7 +95,7 @@ def test_links_meet_where_mujoco_has_contacts(name, tmp_path, device):
 
 def test_visual_geoms_leave_neighbours_out_unless_filterparent_is_disabled(tmp_path):
     def of(name):
-        return tested_pairs(load(ARMS[name], tmp_path, "visual"))
+        return asked_pairs(load(ARMS[name], tmp_path, "visual"))
 
     joined = pairs_of("base one", "world one", "two three", "one two")
     assert not joined & of("plain") and joined <= of("parents") and of("parents") - of("plain") >= joined
@@ -143,3 +144,30 @@ def test_mirrored_meshes_keep_their_outside(scale, tmp_path):
     vertices, faces = robot.models[0].mesh_at(robot.models[0].lod_max)[:2]
     volume = trimesh.Trimesh(vertices, faces, process=False).volume
     np.testing.assert_allclose(volume, 0.006 * abs(np.prod([float(x) for x in scale.split()])), rtol=1e-6)
+
+
+pytest.importorskip("mujoco")
+LETTER = [(0, 0), (4, 0), (4, 1), (1, 1), (1, 3), (4, 3), (4, 4), (0, 4)]  # area 10, perimeter 22
+
+
+def prism(ring):
+    """Return an OBJ file of a prism of height 1, a polygon a side, with vertices that none uses."""
+    count = len(ring)
+    faces = [range(count - 1, -1, -1), range(count, 2 * count)]
+    faces += [(k, (k + 1) % count, (k + 1) % count + count, k + count) for k in range(count)]
+    points = "".join(f"v {x} {y} {z}\n" for z in (0, 1) for x, y in ring)
+    return points + "v 9 9 9\nv 0 0 0\n" + "".join(f"f {' '.join(str(k + 1) for k in face)}\n" for face in faces)
+
+
+@pytest.mark.parametrize("turned", [0, 3, 6])
+@pytest.mark.parametrize("more, scale", [("", 1), ('scale="2 2 -2" refpos="1 2 3" refquat="0 1 0 0"', 2)])
+def test_polygons_do_not_fold(tmp_path, turned, more, scale):
+    (tmp_path / "c.obj").write_text(prism(LETTER[turned:] + LETTER[:turned]))
+    (tmp_path / "a.xml").write_text(
+        f'<mujoco><asset><mesh name="m" file="c.obj" {more}/></asset><worldbody><geom type="mesh" mesh="m"/>'
+        '<body name="arm"><joint name="j" axis="0 0 1"/><geom size="0.1" pos="9 9 9"/></body></worldbody></mujoco>'
+    )
+    model = ab.Robot.load(tmp_path / "a.xml", device="cpu").models[0]
+    solid = trimesh.Trimesh(*model.mesh_at(model.lod_max)[:2])
+    assert solid.is_watertight and len(solid.faces) == 2 * 6 + 2 * 8
+    assert solid.area == pytest.approx((2 * 10 + 22) * scale**2) and solid.volume == pytest.approx(10 * scale**3)

@@ -16,11 +16,11 @@ from helpers.robots import (
     AROUND,
     RING,
     ROOF,
+    asked_pairs,
     described_arm,
     described_chain,
     pose_frames,
     random_configurations,
-    tested_pairs,
 )
 from helpers.samples import STILL
 from helpers.scenes import scene_with
@@ -69,7 +69,7 @@ def test_pairs_leave_neighbours_and_excluded_links_out(device):
     # A mesh of the flange too, which is rigidly fixed to the forearm.
     description.parts.append(replace(description.parts[2], link=3))
     arm = ab.Robot(description, device)
-    pairs = tested_pairs(arm)
+    pairs = asked_pairs(arm)
     around = [(link, other) for link in ("fore", "flange") for other in ("upper", "left", "right", "flap")]
     left_out = {*map(frozenset, around), *map(frozenset, [("base", "upper"), ("fore", "flange"), ("base", "fore")])}
     assert not pairs & left_out and len(pairs) == len(arm.pairs) == 21 - len(left_out)

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 from helpers import refused
-from helpers.robots import MJCF, URDF, pairs_of, random_configurations, tested_pairs, write_arm
+from helpers.robots import MJCF, URDF, asked_pairs, pairs_of, random_configurations, write_arm
 
 import warp_abtree as ab
 
@@ -65,12 +65,12 @@ def test_urdf_meshes_pairs_and_srdf(urdf, tmp_path):
     np.testing.assert_allclose([upper.min(0), upper.max(0)], [[-0.05, -0.04, 0.05], [0.05, 0.15, 0.55]], atol=1e-12)
     # The flange is rigidly joined to the forearm, so that fingers are neighbours of this.
     fingers = pairs_of("base left", "base right", "upper left", "upper right", "left right")
-    assert tested_pairs(arm) == fingers | pairs_of("base fore")
+    assert asked_pairs(arm) == fingers | pairs_of("base fore")
     assert [arm.link_names[k] for k in ab.Robot.load(urdf, "visual", device="cpu").model_link] == ["upper"]
     (tmp_path / "arm.srdf").write_text(SRDF.format("base"), encoding="utf-8")
-    assert tested_pairs(ab.Robot.load(urdf, device="cpu", srdf=tmp_path / "arm.srdf")) == fingers
+    assert asked_pairs(ab.Robot.load(urdf, device="cpu", srdf=tmp_path / "arm.srdf")) == fingers
     neutral = ab.Robot.load(urdf, device="cpu", neutral=[0, 0, 0.0])
-    assert tested_pairs(neutral) == tested_pairs(arm) - pairs_of("left right")
+    assert asked_pairs(neutral) == asked_pairs(arm) - pairs_of("left right")
 
 
 def test_mjcf_meshes_and_pairs(mjcf):
@@ -81,9 +81,9 @@ def test_mjcf_meshes_and_pairs(mjcf):
     names = [arm.link_names[k] for k in arm.model_link]
     assert names == ["base", "upper", "fore", "left", "left", "right"] and not (arm.pairs == 4).any()
     pairs = pairs_of("base left", "base right", "upper left", "upper right", "left right")
-    assert tested_pairs(arm) == pairs | pairs_of("base upper")  # the base stands still
+    assert asked_pairs(arm) == pairs | pairs_of("base upper")  # the base stands still
     visual = ab.Robot.load(mjcf, "visual", device="cpu")
-    assert tested_pairs(visual) == pairs
+    assert asked_pairs(visual) == pairs
     assert visual.models[1].face_count > arm.models[1].face_count
 
 

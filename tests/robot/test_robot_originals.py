@@ -11,7 +11,7 @@ import fcl
 import numpy as np
 import pytest
 import trimesh
-from helpers.robots import pairs_of, random_configurations, tested_pairs
+from helpers.robots import asked_pairs, pairs_of, random_configurations
 from oracles.peers import fcl_object
 
 import warp_abtree as ab
@@ -96,7 +96,7 @@ def check_originals(path, geometry, pairs, follower, base, count, device):
     """Compare with FCL at random configurations, alone and around a ring."""
     robot = ab.Robot.load(path, geometry, device, mounted=[base])
     names = [robot.link_names[k] for k in robot.model_link]
-    assert len(names) == len(set(names)) and tested_pairs(robot) == pairs
+    assert len(names) == len(set(names)) and asked_pairs(robot) == pairs
     files, ring = FilesInFcl(path, geometry), trimesh.creation.torus(0.55, 0.15, 48, 16)
     ring.apply_translation((0, 0, 0.5))
     around = fcl_object(ring.vertices, ring.faces)

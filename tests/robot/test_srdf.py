@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 from helpers import refused
-from helpers.robots import pairs_of, tested_pairs
+from helpers.robots import asked_pairs, pairs_of
 
 import warp_abtree as ab
 
@@ -29,7 +29,7 @@ def load(tmp_path):
 
     def load(srdf, root="robot", **options):
         (tmp_path / "r.srdf").write_text(f'<{root} name="r">{srdf}</{root}>', encoding="utf-8")
-        return tested_pairs(ab.Robot.load(tmp_path / "r.urdf", device="cpu", srdf=tmp_path / "r.srdf", **options))
+        return asked_pairs(ab.Robot.load(tmp_path / "r.urdf", device="cpu", srdf=tmp_path / "r.srdf", **options))
 
     return load
 
