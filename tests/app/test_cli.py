@@ -96,7 +96,6 @@ def test_query_against_the_library(files, capsys):
     assert found["bound"] == (pytest.approx(bound) if np.isfinite(bound) else None)
     extents = [np.ptp(model.mesh_at(model.lod_max)[0], axis=0) for model in scene.models]
     assert found["diagonals"] == pytest.approx([(extent @ extent) ** 0.5 for extent in extents])
-
     apart = answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--output", "distance")
     lower, upper = apart["bracket"]
     assert 0 < lower <= apart["distance"] <= upper and not apart["intersects"]
@@ -154,7 +153,6 @@ def test_contacts_against_the_library(files, capsys, device, precision, b, pose)
     summed = expected.pair_contacts[0]
     assert found["pair_contacts"] == {name: summed[name].tolist() for name in summed.dtype.names}
     assert expected.contacts["coplanar"].any() == (b == "box.obj")
-
     run(capsys, "query", *words, "--device", device, "--record", "arrays.npz")
     with np.load("arrays.npz") as arrays:
         assert set(arrays) == {"any", "count", "faces", "contacts", "pair_contacts"}
@@ -209,9 +207,6 @@ def test_a_mesh_far_from_the_origin_has_bounds(files, capsys):
     assert re.search(r"^bounds +4512344.75 612345 99.5 4512345.75 612346 100.5$", shown, re.M)
 
 
-# Files of several parts.
-
-
 @pytest.fixture
 def assemblies(files):
     """Return files by name with the number of parts of each; those of two and three clash."""
@@ -257,9 +252,6 @@ def test_a_scene_file_of_parts_warns(assemblies):
         told = [str(each.message) for each in caught if "joined" in str(each.message)]
         start = f"scene.toml: models.m: the {parts} parts of {name} are joined into one mesh; scene_from_file"
         assert len(told) == (parts > 1) and all(each.startswith(start) for each in told)
-
-
-# Statuses, help, extras.
 
 
 def test_lost_work_is_status_1(files, capsys, monkeypatch):

@@ -23,9 +23,6 @@ def load(tmp_path, text):
     return load_scene(write_scene(tmp_path, text), device="cpu")
 
 
-# Good ones.
-
-
 def test_smallest_scene(tmp_path):
     loaded = load(tmp_path, ONE)
     assert (loaded.title, loaded.frames, loaded.scene.object_count) == ("scene", 60, 1)
@@ -157,9 +154,6 @@ def test_sweep_of_a_named_object(tmp_path):
     assert len({row.lod_min for row in frame.history}) > 10
 
 
-# Bad ones.
-
-
 SWEPT = ONE + "[[lod_sweep]]\nfrom = 1\nto = 0.1\nperiod = 1\n"
 LOOK = ONE + "[camera]\neye = [0, 0, 1]\n"
 KEY = "[[camera.keys]]\ntime = 0\neye = [0, 0, 1]\ntarget = [0, 0, 0]\n"
@@ -269,9 +263,6 @@ def test_file_that_is_none(tmp_path):
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
     for path, message in ((tmp_path / "gone.toml", ""), (tmp_path, ""), (tmp_path / "bytes.toml", ": not valid TOML")):
         refused(SceneError, f"{path}{message}", load_scene, path, device="cpu")
-
-
-# What would exhaust the memory, or the parser.
 
 
 def deep(count, value="1"):

@@ -73,9 +73,6 @@ def load_ours(name, device, changes=(), **options):
     return load_scene(SCENES / f"{name}.toml", device=device, text=text, **options)
 
 
-# Shapes.
-
-
 @pytest.mark.parametrize(
     ("text", "faces", "volume"),
     [
@@ -138,9 +135,6 @@ def test_a_shape_stands_in_for_meshes_that_are_not_there(tmp_path):
         load(tmp_path, text.replace('"box.obj"', '"gone.obj"').replace('shape = "icosphere"\n', ""))
 
 
-# Copies.
-
-
 def test_a_grid_grows_with_count(tmp_path):
     text = BALL + ROW + "count = 7\nposition = [0, 10, 0]\ngrid = { size = [2, 0, 1], spacing = [1, 3, 1] }\n"
     expected = [[x, 10 + y, 0] for y in (0, 3, 6, 9) for x in (-0.5, 0.5)][:7]
@@ -156,9 +150,6 @@ def test_another_number_of_objects(tmp_path):
         assert loaded.worlds.max() == worlds - 1
     with pytest.raises(SceneError, match="count or worlds"):
         load(tmp_path, BALL + ROW + "grid = { size = [2, 2, 2], spacing = [1, 1, 1] }\n", objects=3)
-
-
-# What steers a run.
 
 
 def test_camera_goes_along_its_key_points(tmp_path):
@@ -239,9 +230,6 @@ def test_rigid_bodies_of_a_file(tmp_path, device):
     assert poses[:24, 1].mean() < start[:24, 1].mean()
     assert np.array_equal(loaded.make_bodies().poses(), start)
     assert [row.hits for row in loaded.frame(controller="none").run(4)] == hits, "a run begins at the start"
-
-
-# The scenes.
 
 
 @pytest.mark.slow

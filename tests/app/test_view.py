@@ -25,9 +25,6 @@ def playback(device):
     return make_playback(device)
 
 
-# Geometry.
-
-
 def test_intersecting_faces_and_triangles(playback):
     snapshot = playback.query("faces")
     result = snapshot.result
@@ -69,9 +66,6 @@ def test_bounds_hold_all_that_is_shown(playback):
     assert radius < 6
 
 
-# Panels of pictures.
-
-
 def test_a_panel_holds_what_the_title_counts(playback):
     cache, snapshot = geometry.MeshCache(playback.scene), playback.query("faces")
     settings = Settings()
@@ -100,9 +94,6 @@ def test_the_camera_sees_all_points():
     local = (points - camera.eye) @ camera.view.T
     assert (local[:, 2] < 0).all()
     assert np.abs(local[:, :2] / local[:, 2:]).max() <= np.tan(0.5 * camera.field_of_view)
-
-
-# The viewer scene.
 
 
 class Handle:

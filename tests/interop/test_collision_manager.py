@@ -72,9 +72,6 @@ def assert_same_names(theirs, ours, call, *arguments):
     return expected[1]
 
 
-# The same answers.
-
-
 def test_names_in_a_scene_that_changes(device, monkeypatch):
     monkeypatch.setattr(collision_manager, "FIRST_PAIRS", 2)
     rng, hits, misses = np.random.default_rng(2), 0, 0
@@ -118,9 +115,6 @@ def test_closed_meshes_are_solids(device, name):
     surfaces.add_object(name, mesh)
     assert not surfaces.in_collision_single(crumb)
     assert inside > 0 or name in ("annulus", "crumbs", "sheet")
-
-
-# Contacts.
 
 
 def distance_to_face(mesh, transform, face, point):
@@ -185,9 +179,6 @@ def test_a_component_inside_a_solid(device):
     assert ours.in_collision_single(parts, shift((-45, 0, 0)))
     assert not ours.in_collision_single(parts, shift((-40, 0, 0)))
     assert hollow.in_collision_single(box) and not hollow.in_collision_single(SHAPES["torus"])
-
-
-# Distances.
 
 
 @pytest.mark.slow
@@ -277,9 +268,6 @@ def test_managers_without_objects(device):
     assert ours.in_collision_internal(True) == (False, set()) and ours.min_distance_internal() == math.inf
 
 
-# Objects added and removed.
-
-
 def test_replaced_and_changed_meshes(device):
     ours = ab.CollisionManager(device)
     mesh = trimesh.creation.box((1, 1, 1))
@@ -332,9 +320,6 @@ def test_equal_meshes_share_a_model_that_goes_with_them(device):
     del managers, manager, model
     gc.collect()
     assert gone() is None and len(placed_shapes._SHAPES) < known
-
-
-# Bad input, refused before anything changes.
 
 
 def test_bad_input(device):

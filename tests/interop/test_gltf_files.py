@@ -100,7 +100,6 @@ def test_sparse_strided_and_quantized_positions(read):
     expected[[k for k in range(8) if k not in moved]] = 0
     whole = np.isin(BOX.faces, moved).sum(axis=1) == 2  # others have two corners at the origin
     np.testing.assert_array_equal(read(tree, blob)["crate"], expected[BOX.faces[whole]])
-
     whole = np.round(POINTS * 2 * 127).astype(np.int8)
     tree, blob = tree_of([np.pad(whole, ((0, 0), (0, 1))), CORNERS], [SOLID])
     tree["accessors"][0] |= {"type": "VEC3", "normalized": True}

@@ -39,9 +39,6 @@ def test_the_predictive_controller_holds_a_budget(device):
     assert predicted["oscillations"] < 1.0
 
 
-# Loads made up by hand.
-
-
 @cache
 def rings():
     return [ab.Model.load(trimesh.creation.torus(0.5, 0.2, major_sections=n, minor_sections=24)) for n in (48, 44)]
@@ -172,9 +169,6 @@ def test_a_climb_is_not_taken_for_growth():
         assert len(plant.rows) < 60
     plant.step()
     assert len(plant.rows) > 10 and plant.controller.predicted_ms == pytest.approx(plant.rows[-1].total_ms, rel=5e-3)
-
-
-# The fit of a rate.
 
 
 def test_fit_finds_slope_and_intercept():

@@ -119,9 +119,6 @@ def test_selection_follows_the_paper(device, threshold):
     assert levels.max() == 50 and (levels[1:] == 0).any()
 
 
-# Ladders.
-
-
 def test_ratio_ladder_has_equal_ratios():
     models = selection_models()
     ladder = Ladder(models, 20, "ratio")
@@ -131,9 +128,6 @@ def test_ratio_ladder_has_equal_ratios():
         assert (faces >= wanted * (1 - 1e-9)).all()
         for level in range(1, 20):  # a coarser LOD would not do
             assert lods[level] == 0 or len(model.mesh_at(int(lods[level]) - 1)[2]) < wanted[level]
-
-
-# Tolerances.
 
 
 def test_tolerance_gives_the_coarsest_level_within_it(device):
@@ -181,9 +175,6 @@ def test_a_controller_refuses_another_scene_than_it_was_made_for(device):
     scene.add(selection_models()[0])
     for call in (controller.view.launch, lambda: controller.next_lods(Feedback(0.0))):
         refused(RuntimeError, "objects were added", call)
-
-
-# Graphs.
 
 
 @pytest.mark.parametrize("kind", [PaperController, ToleranceController, PredictiveController])

@@ -19,9 +19,6 @@ def describe(vertices, faces):
     return describe_mesh(mesh_from_arrays(vertices, faces))
 
 
-# Welding.
-
-
 def test_tiny_coordinates_become_zero_and_far_ones_are_refused():
     below = np.nextafter(2.0**-290, 0)
     mesh = mesh_from_arrays([[0, below, -5e-324], [1, 0, 0], [0, 1, -(2.0**-290)], [0, 0, 0]], [[0, 1, 2], [0, 3, 1]])
@@ -64,7 +61,6 @@ def test_random_soups(soup):
     assert mesh.file_vertex_count == mesh.unreferenced_count + mesh.welded_count + len(mesh.vertices)
     first = [min(i for i in set(faces.ravel().tolist()) if (vertices[i] == x).all()) for x in mesh.vertices]
     assert first == sorted(first)
-
     # The description against sets and dictionaries.
     report = describe_mesh(mesh)
     kept = [tuple(face) for f, face in enumerate(mesh.faces.tolist()) if f not in dropped]
@@ -78,9 +74,6 @@ def test_random_soups(soup):
         joined = [group for group in groups if group & set(face)]
         groups = [group for group in groups if group not in joined] + [set(face).union(*joined)]
     assert report["components"] == len(groups)
-
-
-# Description.
 
 
 def test_describe_cube():
@@ -116,8 +109,6 @@ def test_components_of_shuffled_chains():
     vertices = np.random.default_rng(6).random((chains * size, 3))
     assert describe(vertices, order[faces.reshape(-1, 3)])["components"] == chains
 
-
-# Errors.
 
 BIG = np.broadcast_to(np.array([0, 1, 2], dtype=np.int32), (2**30 + 1, 3))
 

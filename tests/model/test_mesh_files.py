@@ -28,7 +28,6 @@ def test_formats_keep_every_triangle(tmp_path, extension):
     data = shape.export(file_type=kind, **({"digits": 17} if kind in ("obj", "off") else {}))
     data = data.encode() if isinstance(data, str) else data
     path.write_bytes(gzip.compress(data) if extension.endswith(".gz") else data)
-
     mesh = load_mesh(path)
     np.testing.assert_array_equal(mesh.vertices[mesh.faces], shape.vertices[shape.faces])
     assert mesh.name == "some.ball" and load_mesh(str(path), name="x").name == "x"
@@ -113,7 +112,6 @@ def test_trimesh_and_scene():
     np.testing.assert_array_equal(mesh.vertices, shape.vertices)
     np.testing.assert_array_equal(mesh.faces, shape.faces)
     assert mesh.name == "ball"
-
     scene = trimesh.Scene()
     scene.add_geometry(shape, node_name="here")
     mirror = np.array([[0, -1, 0, 4], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], float)
@@ -137,8 +135,6 @@ def test_warp_meshes(name, faces):
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     assert np.abs(np.cross(b - a, c - a).sum(axis=0)).max() < 1e-9 * report["diagonal"] ** 2
 
-
-# Errors.
 
 V = b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 

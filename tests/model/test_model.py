@@ -65,9 +65,6 @@ def refuse(path, *words):
     assert all(word in message for word in words)
 
 
-# Round trips.
-
-
 @pytest.mark.parametrize("name", [*SHAPES, "cow", "fcl-env"])
 def test_round_trip_is_exact(tmp_path, name):
     model = with_errors(sample(name))
@@ -222,9 +219,6 @@ def test_types_shapes_and_values_are_checked(tmp_path, parts):
         refuse(write(tmp_path / "m.npz", {**parts, name: bad}))
 
 
-# Saving.
-
-
 def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "m.npz"
     model, other = with_errors(sample("three")), with_errors(sample("twins"))
@@ -244,9 +238,6 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
     other.save(path)
     assert_same(other, Model.open(path))
     refused(OSError, None, model.save, tmp_path / "absent" / "m.npz")
-
-
-# Arguments.
 
 
 def test_lods_and_requests_of_lods_are_checked():

@@ -54,9 +54,6 @@ def some_lods(model, count=6):
 BOX = trimesh.creation.box().subdivide().subdivide().subdivide()
 
 
-# Validity.
-
-
 def test_flat_regions_cost_nothing():
     """A LOD within the original surface, or within rounding of it, has a bound of that size; edges do not spoil it."""
     for name in ("one", "ball", "soup", "lattice soup", "twins"):
@@ -133,8 +130,6 @@ def test_rounding_is_covered(name):
                 point = [sum(Fraction(w, 4) * Fraction(x) for w, x in zip(weight, axis)) for axis in zip(*triangle)]
                 assert exact_distance_sq(point, corners) <= bound_sq
 
-
-# Tightness.
 
 SHAPES = {
     "torus": lambda: of_trimesh(trimesh.creation.torus(1.0, 0.4, 24, 12)),

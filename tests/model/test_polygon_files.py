@@ -195,8 +195,6 @@ def test_objects_of_dae(tmp_path):
     assert scene.batch().objects.pool.position.numpy().tolist() == [[1, 0, 0], [1, 0, 0], [0, 9, 0]]
 
 
-# What is damaged, cut short or not read.
-
 LATTICE = b'<?xml version="1.0"?><model xmlns:b="http://x/beamlattice/2017/02" requiredextensions="b"></model>'
 FACES, HEAD = [list(range(8))], ply(LETTER, [])
 BOX, PLATE = trimesh.creation.box(), dae(LETTER, polylist(FACES))
@@ -314,9 +312,6 @@ def test_members_of_archives(tmp_path):
     mesh = load_mesh(tmp_path / "a.zip")
     sizes = np.ptp(mesh.vertices[mesh.faces].reshape(3, 36, 3), axis=1)
     assert sizes.tolist() == [[1.0] * 3, [2.0] * 3, [3.0] * 3]
-
-
-# The limit.
 
 
 @pytest.mark.parametrize("name", ["a.obj.gz", "a.zip", "a.3mf", "a.npz"])

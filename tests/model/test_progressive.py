@@ -73,9 +73,6 @@ def mesh(request):
     return mesh_from_arrays(*MESHES[request.param]())
 
 
-# Oracles.
-
-
 def replay(mesh, progressive):
     """Collapse literally, one merge at a time, in plain Python; assert everything that the arrays say about it."""
     p = progressive
@@ -166,9 +163,6 @@ def check_error(mesh, progressive, steps=8, count=3000):
 def assert_same(a, b, names=FOREST):
     for name in names:
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
-
-
-# Collapse.
 
 
 def test_every_prefix_is_a_mesh(mesh):

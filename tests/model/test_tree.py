@@ -15,9 +15,6 @@ from warp_abtree.model.tree import active_build
 pytestmark = pytest.mark.usefixtures("half_refitted_in_part")
 
 
-# Build.
-
-
 def without_merges(vertices, faces):
     return oracle.Progressive([-1] * len(vertices), vertices.tolist(), faces.tolist(), [0] * len(faces), [0], [])
 
@@ -39,9 +36,6 @@ def test_build_of_soups_equals_the_oracle(count, seed, lattice, scale):
 
 def test_build_refuses_no_face():
     refused(ValueError, "1 to 2", active_build, np.zeros((3, 3)), np.zeros((0, 3), np.int32))
-
-
-# Update.
 
 
 def assert_same_bits(state, other):
@@ -158,9 +152,6 @@ def test_walks_over_soups(device, first, second, walk):
         walker.step(np.round(np.array(step) * walker.tops()).astype(int))
 
 
-# What `tree_state` shows.
-
-
 @pytest.mark.parametrize("name", ["one", "crumbs", "soup", "lattice soup"])
 def test_tree_state_shows_the_state(device, name):
     model = sample(name)
@@ -188,16 +179,12 @@ def test_tree_state_shows_the_state(device, name):
         assert (shown.lower[1] > used.min(0) - slack).all() and (shown.upper[1] < used.max(0) + slack).all()
 
 
-# Sharing of states.
-
-
 def test_objects_share_states(device):
     model, other = sample("small ball"), sample("crumbs")
     scene = scene_with(device, model, other, model, model)
     states, objects = scene.batch().states, scene.batch().objects
     assert objects.state[0] == objects.state[2] == objects.state[3] != objects.state[1]
     assert len(states.slots) == 2
-
     scene.set_lods([10, 5, 20, 30])  # more targets than states: copies
     assert len(set(objects.state)) == 4 and len(states.slots) == 4
     room = states.node_room, states.face_room

@@ -188,7 +188,6 @@ def test_common_motions_are_clear(device):
     whole = random_poses(rng, 20, 5.0)
     scene = scene_of(device, cases)
     met = scene.intersect(pairs_of(cases)).any
-
     starts = pose_matrices(starts_of(cases))
     scene.set_poses(starts)
     ends = np.repeat(pose_matrices(whole), 2, 0) @ starts
