@@ -17,8 +17,8 @@ from helpers.scenes import scene_with
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oracles.distance import brute_distances
-from oracles.separation import near_faces
 from oracles.triangle import into_frame_of_a, quaternion_matrix
+from oracles.triangle_distance import near_faces
 
 import warp_abtree as ab
 from warp_abtree import testing
