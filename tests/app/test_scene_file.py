@@ -140,11 +140,8 @@ def test_shapes(tmp_path, shape, parameters, extents):
 
 
 def test_sweep_of_a_named_object(tmp_path):
-    text = (
-        ONE
-        + 'name = "a"\n[[objects]]\nmodel = "ball"\n[[lod_sweep]]\nobjects = ["a"]\nfrom = 1\nto = 0.25\nperiod = 2\n'
-    )
-    loaded = load(tmp_path, text)
+    swept = '[[objects]]\nmodel = "ball"\n[[lod_sweep]]\nobjects = ["a"]\nfrom = 1\nto = 0.25\nperiod = 2\n'
+    loaded = load(tmp_path, ONE + 'name = "a"\n' + swept)
     ball = loaded.models["ball"]
     assert loaded.lods_at(0.0).tolist() == [ball.lod_max] * 2
     assert loaded.lods_at(1.0).tolist() == [ball.lod_for(fraction=0.25), ball.lod_max]
@@ -154,6 +151,8 @@ def test_sweep_of_a_named_object(tmp_path):
     assert len({row.lod_min for row in frame.history}) > 10
 
 
+FLAT = M.format('shape = "terrain"\nextents = [1, 1]\ncells = [2, 2]\nbumps = 0\nwaves = 1\nrim = 0')
+LARGE = "".join(f"[models.m{i}]\nshape = 'icosphere'\nsubdivisions = 8\n" for i in range(4))
 SWEPT = ONE + "[[lod_sweep]]\nfrom = 1\nto = 0.1\nperiod = 1\n"
 LOOK = ONE + "[camera]\neye = [0, 0, 1]\n"
 KEY = "[[camera.keys]]\ntime = 0\neye = [0, 0, 1]\ntarget = [0, 0, 0]\n"
@@ -177,10 +176,7 @@ KEY = "[[camera.keys]]\ntime = 0\neye = [0, 0, 1]\ntarget = [0, 0, 0]\n"
         (M.format('shape = "box"\nextents = [1, 2]'), "models.m.extents: expected a list of length 3, got 2"),
         (M.format('mesh = "gone.obj"'), "gone.obj: no such file"),
         (M.format('mesh = ["a.obj", "b.obj"]'), "b.obj: no such file"),
-        (
-            M.format('shape = "revolve"\nprofile = [[1, 0], [1, 0]]\nsections = 9'),
-            "models.m.shape: profile: z",
-        ),
+        (M.format('shape = "revolve"\nprofile = [[1, 0], [1, 0]]\nsections = 9'), "models.m.shape: profile: z"),
         (M.format('shape = "revolve"\nprofile = [[0, 0], [1, 1]]'), "models.m.profile[0][0]: expected a number > 0"),
         (ONE.replace("[[", "size = 1\nscale = 2\n[["), "give size or scale"),
         (ONE.replace("[[", "scale = 1e300\n[["), "models.ball: "),
@@ -222,11 +218,7 @@ KEY = "[[camera.keys]]\ntime = 0\neye = [0, 0, 1]\ntarget = [0, 0, 0]\n"
         (ONE + '[lod]\ncontroller = "paper"\n', "lod: controller 'paper' needs a budget"),
         (ONE + '[lod]\ncontroller = "paper"\nbudget_ms = 1\nspacing = "ratio"\n', "lod.spacing: the LODs"),
         (ONE + "[lod]\nbudget_ms = 1\nlow = 0.9\naim = 0.5\n", "lod.low: is above aim"),
-        (
-            M.format('shape = "terrain"\nextents = [1, 1]\ncells = [2, 2]\nbumps = 0\nwaves = 1\nrim = 0')
-            + "[dynamics]\n",
-            "scene.toml: objects: model 'm' is flat",
-        ),
+        (FLAT + "[dynamics]\n", "scene.toml: objects: model 'm' is flat"),
         (LOOK, "camera: the key 'target' is missing"),
         (LOOK + "target = [0, 0, 1]\n", "camera: the camera looks at its own eye"),
         (LOOK + KEY, "camera: give eye and target, or"),
@@ -293,10 +285,7 @@ def deep(count, value="1"):
         (M.format('shape = "uv_sphere"\ncount = [10000, 10000]'), "models.m: asks for 400,160,016 faces; a file may"),
         (M.format('shape = "box"\nfaces = 2000000000'), "models.m: asks for 2,000,000,000 faces"),
         (M.format('shape = "box"\nfaces = 4000000'), "models.m: faces: Loop subdivision of 12 faces reaches 3,145,728"),
-        (
-            "".join(f"[models.m{i}]\nshape = 'icosphere'\nsubdivisions = 8\n" for i in range(4)) + ONE,
-            "models.m3: asks for 1,310,720 faces, 5,242,880 with those of the models before",
-        ),
+        (LARGE + ONE, "models.m3: asks for 1,310,720 faces, 5,242,880 with those of the models before"),
         (ONE + "count = 2\n" + ONE[len(BALL) :] + "worlds = 1000000\n", "objects[1].worlds: more than 1,000,000"),
         (ONE + "[picture]\nlods = " + str(100 * [0.5]), "picture.lods: expected a list of length <= 64"),
     ],

@@ -154,11 +154,8 @@ def test_another_number_of_objects(tmp_path):
 
 def test_camera_goes_along_its_key_points(tmp_path):
     camera = load(tmp_path, STEERED).camera
-    for time, eye, target in (
-        (-1, [0, 0, 9], [0, 0, 0]),
-        (0.25, [1, 0, 4.5], [0, 0, -4.5]),
-        (9, [2, 0, 0], [0, 0, -9]),
-    ):
+    key_points = (-1, [0, 0, 9], [0, 0, 0]), (0.25, [1, 0, 4.5], [0, 0, -4.5]), (9, [2, 0, 0], [0, 0, -9])
+    for time, eye, target in key_points:
         found = camera(time)
         back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
         assert np.allclose(found.eye, eye) and np.allclose(found.view[2], back) and found.far == 20

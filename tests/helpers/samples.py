@@ -158,16 +158,9 @@ def raw_state(scene, i):
 
 # A ball, and a ring that moves through it to and fro; tests add what they ask about.
 SHUTTLE_SCENE = """
-[scene]
-frames = 4
-time_step = 0.25
-[models.ball]
-shape = "icosphere"
-subdivisions = 2
-[models.ring]
-shape = "torus"
-major_radius = 1.0
-minor_radius = 0.3
+scene = { frames = 4, time_step = 0.25 }
+models.ball = { shape = "icosphere", subdivisions = 2 }
+models.ring = { shape = "torus", major_radius = 1.0, minor_radius = 0.3 }
 [[objects]]
 model = "ball"
 name = "ball"

@@ -12,6 +12,7 @@ import warp_abtree as ab
 BEND_LIMIT, GRIP_LIMIT = (
     f'<limit lower="{low}" upper="{high}" effort="1" velocity="1"/>' for low, high in ((-2.8, 2.8), (0, 0.1))
 )
+FLEX = """<flexcomp name="rag" type="grid" count="3 3 1" spacing="1 1 1" dim="2"><edge equality="true"/></flexcomp>"""
 SRDF = '<robot name="arm"><disable_collisions link1="{}" link2="fore" reason="Never"/></robot>'
 
 
@@ -156,19 +157,10 @@ def test_bad_urdf_is_refused(urdf, before, after, message):
         ('type="cylinder" size="0.1 0.1"', 'name="ground" type="plane" size="1 1 1"', "geom 'ground' is a plane"),
         ('polycoef="-0.04 -1 0 0 0"', 'polycoef="0 -1 1 0 0"', "follows another by a curve"),
         ("</equality>", '<joint joint1="follow" joint2="turn"/></equality>', "joint 'follow' follows two others"),
-        (
-            "</body></worldbody>",
-            '<flexcomp name="rag" type="grid" count="3 3 1" spacing="1 1 1" dim="2"><edge equality="true"/>'
-            "</flexcomp></body></worldbody>",
-            "flex 'rag' may deform",
-        ),
+        ("</body></worldbody>", FLEX + "</body></worldbody>", "flex 'rag' may deform"),
         ('file="part.stl"', 'file="lost.stl"', "lost.stl"),
         ('<body name="flange" pos="0 0 0.45">', '<body><body name="body 4"/>', "2 bodies have the name 'body 4'"),
-        (
-            '<joint name="turn" axis="0 0 1"/>',
-            '<joint/><joint name="joint 0" axis="1 0 0"/>',
-            "2 joints have the name 'joint 0'",
-        ),
+        ('<joint name="turn" axis="0 0 1"/>', '<joint/><joint name="joint 0"/>', "2 joints have the name 'joint 0'"),
     ],
 )
 def test_bad_mjcf_is_refused(mjcf, before, after, message):
