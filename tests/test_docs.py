@@ -13,6 +13,7 @@ import pytest
 import trimesh
 import trimesh.collision
 import warp as wp
+from helpers import refused
 
 from bench import __main__ as bench
 from warp_abtree.app import load_scene
@@ -313,8 +314,7 @@ def test_worlds_example(device):
 
 def test_worlds_example_without_torch(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(SystemExit, match="skipped: this example needs PyTorch"):
-        run_example("worlds_torch", "--device", "cpu")
+    refused(SystemExit, "skipped: this example needs PyTorch", run_example, "worlds_torch", "--device", "cpu")
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import math
 import re
 import sys
 import warnings
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from helpers.scenes import scene_with
 from helpers.viewer import run_command as run
 
 import warp_abtree as ab
@@ -86,9 +86,7 @@ def test_query_against_the_library(files, capsys):
     asked = ("ball.obj", "ring.ply", "--pose", *ASIDE, "--lod-a", 0.25, "--lod-b", "900", "--output", "faces")
     found = answer(capsys, *asked)
     ball, ring = ab.Model.load("ball.obj"), ab.Model.load("ring.ply")
-    scene = ab.Scene(device="cpu")
-    scene.add(ball, lod=ball.lod_for(fraction=0.25))
-    scene.add(ring, pose=ASIDE, lod=900)
+    scene = scene_with("cpu", (ball, {"lod": ball.lod_for(fraction=0.25)}), (ring, ASIDE, {"lod": 900}))
     expected = scene.intersect(np.array([[0, 1]]), output="faces")
     assert found["faces"] == expected.faces[:, 1:].tolist()
     assert found["count"] == expected.count[0] and found["intersects"] is True
@@ -97,7 +95,6 @@ def test_query_against_the_library(files, capsys):
     assert found["bound"] == (pytest.approx(bound) if np.isfinite(bound) else None)
     extents = [np.ptp(model.mesh_at(model.lod_max)[0], axis=0) for model in scene.models]
     assert found["diagonals"] == pytest.approx([(extent @ extent) ** 0.5 for extent in extents])
-
     apart = answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--output", "distance")
     lower, upper = apart["bracket"]
     assert 0 < lower <= apart["distance"] <= upper and not apart["intersects"]
@@ -137,9 +134,7 @@ def test_query_against_the_library(files, capsys):
 @pytest.mark.slow
 def test_contacts_against_the_library(files, capsys, device, precision, b, pose):
     a = "ball.obj" if b == "ring.ply" else b
-    scene = ab.Scene(device)
-    scene.add(ab.Model.load(a))
-    scene.add(ab.Model.load(b), pose=pose)
+    scene = scene_with(device, ab.Model.load(a), (ab.Model.load(b), pose))
     expected = scene.intersect(np.array([[0, 1]]), output="contacts", precision=precision)
     words = (a, b, "--pose", *pose, "--output", "contacts", "--precision", precision)
     found = answer(capsys, *words, "--record", "rows.csv", device=device)
@@ -157,7 +152,6 @@ def test_contacts_against_the_library(files, capsys, device, precision, b, pose)
     summed = expected.pair_contacts[0]
     assert found["pair_contacts"] == {name: summed[name].tolist() for name in summed.dtype.names}
     assert expected.contacts["coplanar"].any() == (b == "box.obj")
-
     run(capsys, "query", *words, "--device", device, "--record", "arrays.npz")
     with np.load("arrays.npz") as arrays:
         assert set(arrays) == {"any", "count", "faces", "contacts", "pair_contacts"}
@@ -181,27 +175,15 @@ def test_record_of_each_output(files, capsys):
     assert rows[0] == ["face_a", "face_b"] and [[int(x) for x in row] for row in rows[1:]] == found["faces"]
 
 
-@pytest.mark.parametrize(
-    ("value", "shown"),
-    [
-        (0.0, "0"),
-        (-0.0, "0"),
-        (1 / 3, "0.333333"),
-        (1e-16, "1e-16"),
-        (1234.5678, "1234.57"),
-        (123456.789, "123456.79"),
-        (4512345.678, "4512345.68"),
-        (-4512345.678, "-4512345.68"),
-        (999999.996, "999999.996"),
-        (1e6, "1000000"),
-        (1e15, "1e+15"),
-        (np.float32(0.1), "0.1"),
-        (math.inf, "inf"),
-        (math.nan, "none"),
-    ],
-)
-def test_numbers_for_people(value, shown):
-    assert report.show_number(value) == shown
+# Numbers as they are given, and as they are shown.
+SHOWN = """0:0 -0.0:0 0.3333333333333333:0.333333 1e-16:1e-16 1234.5678:1234.57 123456.789:123456.79
+4512345.678:4512345.68 -4512345.678:-4512345.68 999999.996:999999.996 1e6:1000000 1e15:1e+15 inf:inf nan:none""".split()
+
+
+@pytest.mark.parametrize("case", SHOWN)
+def test_numbers_for_people(case):
+    value, shown = case.split(":")
+    assert report.show_number(float(value)) == shown and report.show_number(np.float32(0.1)) == "0.1"
 
 
 def test_a_mesh_far_from_the_origin_has_bounds(files, capsys):
@@ -210,9 +192,6 @@ def test_a_mesh_far_from_the_origin_has_bounds(files, capsys):
     mesh.export("far.obj", digits=9)
     shown, _ = run(capsys, "info", "far.obj")
     assert re.search(r"^bounds +4512344.75 612345 99.5 4512345.75 612346 100.5$", shown, re.M)
-
-
-# Files of several parts.
 
 
 @pytest.fixture
@@ -260,9 +239,6 @@ def test_a_scene_file_of_parts_warns(assemblies):
         told = [str(each.message) for each in caught if "joined" in str(each.message)]
         start = f"scene.toml: models.m: the {parts} parts of {name} are joined into one mesh; scene_from_file"
         assert len(told) == (parts > 1) and all(each.startswith(start) for each in told)
-
-
-# Statuses, help, extras.
 
 
 def test_lost_work_is_status_1(files, capsys, monkeypatch):

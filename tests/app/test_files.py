@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.scenes import scene_with
 
 import warp_abtree as ab
 from bench.tables import write_json
@@ -101,9 +102,7 @@ def write_bytes(path):
 
 
 def run_frame():
-    scene = ab.Scene("cpu")
-    for _ in range(2):
-        scene.add(MODEL)
+    scene = scene_with("cpu", MODEL, MODEL)
     frame = ab.Frame(scene, output="contacts")
     return frame, frame.step()
 

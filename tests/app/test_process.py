@@ -282,9 +282,6 @@ def test_ray_leaves_a_program_its_handler(monkeypatch):
         signal.signal(signal.SIGTERM, before)
 
 
-# Progress.
-
-
 class Terminal(io.StringIO):
     def isatty(self):
         return True

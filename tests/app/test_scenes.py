@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from helpers import refused
 from helpers.samples import true_faces
 from helpers.viewer import write_scene
 from msgspec import convert, toml
@@ -72,9 +73,6 @@ def load_ours(name, device, changes=(), **options):
     return load_scene(SCENES / f"{name}.toml", device=device, text=text, **options)
 
 
-# Shapes.
-
-
 @pytest.mark.parametrize(
     ("text", "faces", "volume"),
     [
@@ -137,9 +135,6 @@ def test_a_shape_stands_in_for_meshes_that_are_not_there(tmp_path):
         load(tmp_path, text.replace('"box.obj"', '"gone.obj"').replace('shape = "icosphere"\n', ""))
 
 
-# Copies.
-
-
 def test_a_grid_grows_with_count(tmp_path):
     text = BALL + ROW + "count = 7\nposition = [0, 10, 0]\ngrid = { size = [2, 0, 1], spacing = [1, 3, 1] }\n"
     expected = [[x, 10 + y, 0] for y in (0, 3, 6, 9) for x in (-0.5, 0.5)][:7]
@@ -157,16 +152,10 @@ def test_another_number_of_objects(tmp_path):
         load(tmp_path, BALL + ROW + "grid = { size = [2, 2, 2], spacing = [1, 1, 1] }\n", objects=3)
 
 
-# What steers a run.
-
-
 def test_camera_goes_along_its_key_points(tmp_path):
     camera = load(tmp_path, STEERED).camera
-    for time, eye, target in (
-        (-1, [0, 0, 9], [0, 0, 0]),
-        (0.25, [1, 0, 4.5], [0, 0, -4.5]),
-        (9, [2, 0, 0], [0, 0, -9]),
-    ):
+    key_points = (-1, [0, 0, 9], [0, 0, 0]), (0.25, [1, 0, 4.5], [0, 0, -4.5]), (9, [2, 0, 0], [0, 0, -9])
+    for time, eye, target in key_points:
         found = camera(time)
         back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
         assert np.allclose(found.eye, eye) and np.allclose(found.view[2], back) and found.far == 20
@@ -198,8 +187,7 @@ def test_controllers_of_a_file(tmp_path):
         (plain, {"controller": "tolerance"}, "needs lod.tolerance"),
         (plain, {"controller": "x"}, "none of"),
     ):
-        with pytest.raises(ValueError, match=message):
-            source.frame(**asked)
+        refused(ValueError, message, source.frame, **asked)
 
 
 @pytest.mark.slow
@@ -239,9 +227,6 @@ def test_rigid_bodies_of_a_file(tmp_path, device):
     assert poses[:24, 1].mean() < start[:24, 1].mean()
     assert np.array_equal(loaded.make_bodies().poses(), start)
     assert [row.hits for row in loaded.frame(controller="none").run(4)] == hits, "a run begins at the start"
-
-
-# The scenes.
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import PIL.Image
 import pytest
+from helpers import refused
 from helpers.viewer import make_models, make_playback, run_command, write_scene
 
 import warp_abtree as ab
@@ -91,12 +92,12 @@ def fill(headers, port=8080):
     return [(key, re.sub("P$", str(port), value).replace("NAME", name)) for key, value in headers.items()]
 
 
-@pytest.mark.parametrize(("headers", "refused"), ASKED)
-def test_pages_of_others_are_refused(headers, refused):
+@pytest.mark.parametrize(("headers", "marks"), ASKED)
+def test_pages_of_others_are_refused(headers, marks):
     request = SimpleNamespace(headers=Headers(fill(headers)))
-    for host, mark in zip(("127.0.0.1", "0.0.0.0", "View.example"), refused):
+    for host, mark in zip(("127.0.0.1", "0.0.0.0", "View.example"), marks):
         assert is_refused(request, host) is (mark == "x")
-    assert is_refused(request, "localhost") is is_refused(request, "::1") is (refused[0] == "x")
+    assert is_refused(request, "localhost") is is_refused(request, "::1") is (marks[0] == "x")
 
 
 def test_what_is_said_twice_is_refused():
@@ -109,12 +110,12 @@ def test_the_server_refuses_websockets_and_files(server):
     """Answers of HTTP to what `ASKED` sends, as of browsers, over a plain socket."""
     upgrade = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
     upgrade |= {"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Protocol": "viser-v1"}
-    for headers, refused in ASKED:
+    for headers, marks in ASKED:
         for more, status in (({}, 200), (upgrade, 101)):
             lines = [f"{key}: {value}" for key, value in [*fill(headers, server.get_port()), *more.items()]]
             with socket.create_connection(("127.0.0.1", server.get_port()), timeout=20) as asked:
                 asked.sendall("\r\n".join(["GET / HTTP/1.1", *lines, "", ""]).encode())
-                assert int(asked.recv(100).split()[1]) == (403 if refused[0] == "x" else status), (headers, more)
+                assert int(asked.recv(100).split()[1]) == (403 if marks[0] == "x" else status), (headers, more)
 
 
 def test_a_server_that_does_not_ask_is_not_used():
@@ -174,12 +175,9 @@ def test_a_scene_made_in_python_is_shown(device, capsys):
 
 
 def test_what_view_refuses(device):
-    with pytest.raises(TypeError, match="not a Scene"):
-        view(make_models()[0])
-    with pytest.raises(ValueError, match="no object"):
-        view(ab.Scene(device))
-    with pytest.raises(ValueError, match="port"):
-        view(ab.Scene(device), port=-1)
+    refused(TypeError, "not a Scene", view, make_models()[0])
+    refused(ValueError, "no object", view, ab.Scene(device))
+    refused(ValueError, "port", view, ab.Scene(device), port=-1)
 
 
 def test_a_port_that_is_taken(tmp_path, capsys):

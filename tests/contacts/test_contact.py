@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.bodies import box
-from helpers.contacts import check_summaries, exact_normal, lies_in_plane, unit
+from helpers.contacts import check_mirrored, check_summaries, exact_normal, lies_in_plane, unit
 from helpers.samples import SHAPES, STILL, contact_poses, sample, soup
+from helpers.scenes import scene_with
 from oracles.distance import brute_distances
 from oracles.triangle import cross, into_frame_of_a, quaternion_matrix, shared_polygon
 
@@ -36,10 +37,7 @@ def model_of(name):
 
 def contacts_of(device, *placed, pairs=((0, 1),), **options):
     """Return the contacts of a scene of (model, pose)."""
-    scene = ab.Scene(device)
-    for model, pose in placed:
-        scene.add(model, pose)
-    result = scene.intersect(np.array(pairs), output="contacts", **options)
+    result = scene_with(device, *placed).intersect(np.array(pairs), output="contacts", **options)
     result.check()
     return result
 
@@ -136,11 +134,7 @@ def test_batches_in_the_world(device, names):
     assert again.pair_contacts.tobytes() == result.pair_contacts.tobytes()
     swapped = contacts_of(device, *placed, pairs=pairs[:, ::-1])
     check_fields(swapped)
-    turned = result.contacts[np.lexsort((*result.contacts["faces"].T, result.contacts["pair"]))]
-    np.testing.assert_array_equal(swapped.contacts["faces"], turned["faces"][:, ::-1])
-    np.testing.assert_array_equal(swapped.contacts["normal"], -turned["normal"])
-    for name, other in (("p0", "p1"), ("p1", "p0"), ("normal_a", "normal_b"), ("coplanar", "coplanar")):
-        np.testing.assert_array_equal(swapped.contacts[name], turned[other])
+    check_mirrored(result.contacts, swapped.contacts)
     some = result.count > 0
     for name, sign in (("point", 1), ("normal", -1), ("travel", 1)):
         before = result.pair_contacts[name][some]
@@ -159,16 +153,18 @@ def test_contacts_need_no_pickle(device, tmp_path):
             assert file[name].tobytes() == getattr(result, name).tobytes()
 
 
-def test_powers_of_two_scale_every_bit(device):
+@pytest.mark.parametrize("gap", [None, 0.1])
+def test_powers_of_two_scale_every_bit(device, gap):
     plain, (soup_mesh, ball_mesh) = None, (SHAPES[name]() for name in ("soup", "ball"))
     turn = np.array([0.1, 0.2, 0.3, 0.9]) / np.linalg.norm([0.1, 0.2, 0.3, 0.9])
     for k in (0, -60, 60):
         a, b = (ab.Model.from_arrays(np.ldexp(vertices, k), faces) for vertices, faces in (soup_mesh, ball_mesh))
-        result = contacts_of(device, (a, STILL), (b, [*np.ldexp([0.3, 0.2, 0.1], k), *turn]))
+        options = {} if gap is None else {"gap": np.ldexp(gap, k)}
+        result = contacts_of(device, (a, STILL), (b, [*np.ldexp([0.3, 0.2, 0.1], k), *turn]), **options)
         plain = result if plain is None else plain
         for rows, wanted in ((result.contacts, plain.contacts), (result.pair_contacts, plain.pair_contacts)):
             for name in rows.dtype.names:
-                scaled = name in ("p0", "p1", "point", "travel")
+                scaled = name in ("p0", "p1", "separation", "point", "travel")
                 np.testing.assert_array_equal(rows[name], np.ldexp(wanted[name], k) if scaled else wanted[name])
 
 

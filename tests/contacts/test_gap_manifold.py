@@ -5,8 +5,10 @@ import itertools
 import numpy as np
 import pytest
 import trimesh
-from helpers.bodies import about, box, model_of
+from helpers.bodies import FLOOR, about, box, model_of
+from helpers.contacts import ask_points
 from helpers.samples import STILL, random_poses, sample
+from helpers.scenes import scene_with
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
@@ -15,37 +17,12 @@ from warp_abtree import testing
 UP = [0, 0, 1.0]
 
 
-def ask(device, *placed, **options):
-    """Return the query of (model, pose) in a scene, and what it finds."""
-    scene = ab.Scene(device)
-    for model, pose in placed:
-        scene.add(model, pose=pose)
-    query = ab.ManifoldQuery(scene, **options)
-    return query, query.run()
-
-
-@pytest.mark.parametrize("splits", [(0, 0), (3, 0), (2, 2)])
-@pytest.mark.parametrize("height", [-0.01, 0.0, 0.01])
-def test_a_box_over_a_floor_has_its_four_corners(device, splits, height):
-    floor, cube = box(4, 4, 1, splits=splits[0]), box(1, 0.8, 0.6, splits=splits[1])
-    turned = about(UP, 0.3)
-    placed = (floor, (0, 0, -0.5, 0, 0, 0, 1)), (cube, (0.1, 0.2, 0.3 + height, *turned))
-    points = ask(device, *placed, gap=0.03)[1].points
-    np.testing.assert_allclose(points["normal"], [UP] * len(points["normal"]), atol=1e-9)
-    np.testing.assert_allclose(points["depth"], -height, atol=1e-12)
-    r = quaternion_matrix(turned)
-    for x, y in itertools.product((-0.5, 0.5), (-0.4, 0.4)):
-        corner = r @ [x, y, -0.3] + [0.1, 0.2, 0.3 + height]
-        away = np.linalg.norm(points["point"] - corner, axis=1)
-        assert away.min() < (0.02 if splits == (0, 0) else 0.2)
-
-
 @pytest.mark.parametrize("splits", [0, 3])
 def test_a_tilted_box_has_points_inside_and_outside(device, splits):
     """An edge is in the floor, the one across from it apart: depths are minus the heights of corners."""
     floor, cube, tilt = box(4, 4, 1, splits=splits), box(1, 1, 1), 0.03
     pose = (0.01, 0.02, 0.5, *about((0, 1, 0), tilt))
-    points = ask(device, (floor, (0, 0, -0.5, 0, 0, 0, 1)), (cube, pose), gap=0.05)[1].points
+    points = ask_points(device, (floor, FLOOR), (cube, pose), gap=0.05)[1].points
     r = quaternion_matrix(pose[3:])
     for x, y in itertools.product((-0.5, 0.5), repeat=2):
         corner = r @ [x, y, -0.5] + pose[:3]
@@ -56,22 +33,11 @@ def test_a_tilted_box_has_points_inside_and_outside(device, splits):
     assert (points["normal"] @ UP > 0.99).all()
 
 
-def test_edges_and_corners_that_are_apart(device):
-    bar, half = box(4, 0.5, 0.5), np.sqrt(0.125)
-    on_edge = about((1, 0, 0), np.pi / 4)
-    across = np.eye(4)
-    across[:3, :3] = quaternion_matrix(about(UP, np.pi / 2)) @ quaternion_matrix(on_edge)
-    across[2, 3] = 2 * half + 0.02
-    points = ask(device, (bar, (0, 0, 0, *on_edge)), (bar, across), gap=0.03)[1].points
-    assert points["depth"].max() == pytest.approx(-0.02, abs=1e-12)
+def test_a_corner_over_a_face(device):
+    pose = (0, 0, 0.5 + np.sqrt(0.75) + 0.01, *about((1, -1, 0), np.arctan(np.sqrt(2))))
+    points = ask_points(device, (box(4, 4, 1), STILL), (box(1, 1, 1), pose), gap=0.02)[1].points
+    assert points["depth"].max() == pytest.approx(-0.01, abs=1e-9)
     np.testing.assert_allclose(points["normal"], [UP] * len(points["normal"]), atol=1e-9)
-    assert np.abs(points["point"][:, :2]).max() < 0.05
-    corner = about((1, -1, 0), np.arctan(np.sqrt(2)))
-    points = ask(device, (box(4, 4, 1), STILL), (box(1, 1, 1), (0, 0, 0.5 + np.sqrt(0.75) + 0.01, *corner)), gap=0.02)[
-        1
-    ]
-    assert points.points["depth"].max() == pytest.approx(-0.01, abs=1e-9)
-    np.testing.assert_allclose(points.points["normal"], [UP] * len(points.points["normal"]), atol=1e-9)
 
 
 @pytest.mark.parametrize("height", [-0.002, 0.001, 0.01])
@@ -80,7 +46,7 @@ def test_faces_ahead_on_a_floor_do_not_stop_what_slides(device, height):
     rng, floor, cube = np.random.default_rng(0), box(4, 4, 1, splits=4), box(0.7, 0.6, 0.5, splits=1)
     for _ in range(25):
         pose = (*rng.uniform(-1, 1, 2), 0.25 + height, *about(UP, rng.uniform(0, 3)))
-        points = ask(device, (floor, (0, 0, -0.5, 0, 0, 0, 1)), (cube, pose), gap=0.06)[1].points
+        points = ask_points(device, (floor, FLOOR), (cube, pose), gap=0.06)[1].points
         assert len(points["normal"]) >= 4
         np.testing.assert_allclose(points["normal"], [UP] * len(points["normal"]), atol=0.05)
 
@@ -90,7 +56,7 @@ def test_the_deepest_point_is_kept(device):
     rng, ball = np.random.default_rng(1), sample("small ball")
     for pose in random_poses(rng, 12, 0.5):
         pose[:3] *= 2.03 / np.linalg.norm(pose[:3])
-        query, result = ask(device, (ball, STILL), (ball, pose), pairs=[(0, 1)], gap=0.1)
+        query, result = ask_points(device, (ball, STILL), (ball, pose), pairs=[(0, 1)], gap=0.1)
         distance = query.batch and ab.DistanceQuery(query.batch, [(0, 1)]).run().distance[0]
         depth = result.points["depth"]
         assert 0 < len(depth) <= 8 and not result.any[0]
@@ -102,9 +68,7 @@ def test_the_deepest_point_is_kept(device):
 def test_points_keep_their_order_while_a_box_slides(device, rocks):
     """Points that stay, as a box slides over the edges of a floor or rocks on it, come in the same order as before."""
     floor, cube = box(4, 4, 1, splits=4), box(0.7, 0.6, 0.5)
-    scene = ab.Scene(device)
-    scene.add(floor, (0, 0, -0.5, 0, 0, 0, 1))
-    scene.add(cube)
+    scene = scene_with(device, (floor, FLOOR), cube)
     query, before, kept = ab.ManifoldQuery(scene, gap=0.02), None, 0
     for step in range(120):
         turned = about((0.002, 0.001, 1), 0.4 + 0.002 * step)
@@ -131,7 +95,7 @@ def test_same_bits_on_every_path(device, gap):
     placed = [(torus, pose) for pose in random_poses(rng, 9, 0.9)]
     for where, warps in (("cpu", False), (device, True), (device, None)):
         with testing.regime(warps=warps):
-            points = ask(where, *placed, gap=gap)[1].points
+            points = ask_points(where, *placed, gap=gap)[1].points
         found.append([points[name].tobytes() for name in ("pair", "point", "normal", "depth")])
     assert found[0] == found[1] == found[2]
     assert (points["depth"] < 0).any() == (gap is not None) and (points["depth"] > 0).any()
@@ -145,7 +109,7 @@ def test_normals_serve_where_the_distance_is_nearly_along_them(device, tilt, ser
     height, rise = 0.1, np.tan(tilt)
     lower = ab.Model.from_arrays([[0, -1, 0], [0, 1, 0], [-1, 0, -rise]], [[0, 1, 2]], base_faces=1)
     upper = ab.Model.from_arrays([[-1, 0, height], [1, 0, height], [0, 1, height + rise]], [[1, 0, 2]], base_faces=1)
-    points = ask(device, (lower, STILL), (upper, STILL), gap=0.2)[1].points
+    points = ask_points(device, (lower, STILL), (upper, STILL), gap=0.2)[1].points
     assert points["depth"].max() == pytest.approx(-height / (np.cos(tilt) if serves else 1), rel=1e-9)
     assert points["normal"][0] @ UP == pytest.approx(np.cos(tilt) if serves else 1, abs=1e-9)
 
@@ -155,7 +119,7 @@ def test_edges_have_points_only_where_no_other_face_is_nearer(device, named):
     """Every contact of faces that are apart, by NumPy: its nearest points against all faces in contact with its own."""
     torus = model_of(trimesh.creation.torus(0.5, 0.2, 24, 12))
     poses = [(0, 0, 0, 0, 0, 0, 1), (0.6, 0.1, 0.43, *about((1, 2, 0.5), 0.4))]
-    query = ask(device, *((torus, pose) for pose in poses), pairs=[named], gap=0.15)[0]
+    query = ask_points(device, *((torus, pose) for pose in poses), pairs=[named], gap=0.15)[0]
     count = query.start.numpy()[1]
     read = {name: getattr(query.contacts, name).numpy()[:count] for name in ("p0", "p1", "normal", "separation")}
     sides = [query.contacts.normal_a.numpy()[:count], query.contacts.normal_b.numpy()[:count]]

@@ -7,21 +7,15 @@ import runpy
 import numpy as np
 import pytest
 import trimesh
-from helpers.bodies import about, box, model_of
+from helpers import refused
+from helpers.bodies import FLOOR, about, box, model_of
+from helpers.contacts import ask_points
 from helpers.questions import to_matrix
 from helpers.samples import STILL, random_poses
+from helpers.viewer import place
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
-
-
-def ask(device, *placed, **options):
-    """Return the query of (model, pose) in a scene, and what it finds."""
-    scene = ab.Scene(device)
-    for model, pose in placed:
-        scene.add(model, pose=pose)
-    query = ab.ManifoldQuery(scene, **options)
-    return query, query.run()
 
 
 def clip_area_vector(half, pose, other_half, other_pose):
@@ -50,39 +44,40 @@ def check_upward(points, tolerance=1e-9):
     np.testing.assert_allclose(points["normal"] - [0, 0, 1.0], 0, atol=tolerance)
 
 
-@pytest.mark.parametrize("splits", [(0, 0), (2, 2)])
-def test_a_box_on_a_floor_has_its_four_corners(device, splits):
+@pytest.mark.parametrize("splits", [(0, 0), (3, 0), (2, 2)])
+@pytest.mark.parametrize(("height", "gap"), [(-0.01, None), (-0.01, 0.03), (0.0, 0.03), (0.01, 0.03)])
+def test_a_box_at_a_floor_has_its_four_corners(device, splits, height, gap):
     floor, cube = box(4, 4, 1, splits=splits[0]), box(1, 0.8, 0.6, splits=splits[1])
-    turned = about((0, 0, 1), 0.3)
-    points = ask(device, (floor, (0, 0, -0.5, 0, 0, 0, 1)), (cube, (0.1, 0.2, 0.29, *turned)))[1].points
-    check_upward(points, 1e-12)
-    np.testing.assert_allclose(points["depth"], 0.01, atol=1e-12)
-    r = quaternion_matrix(turned)
+    pose = (0.1, 0.2, 0.3 + height, *about((0, 0, 1), 0.3))
+    points = ask_points(device, (floor, FLOOR), (cube, pose), gap=gap)[1].points
+    check_upward(points, 1e-9 if gap else 1e-12)
+    np.testing.assert_allclose(points["depth"], -height, atol=1e-12)
     for x, y in itertools.product((-0.5, 0.5), (-0.4, 0.4)):
-        corner = r @ [x, y, -0.3] + [0.1, 0.2, 0.29]
-        away = np.linalg.norm(points["point"] - corner, axis=1)
-        # Where both are finely meshed the place of a point is that of a column, one of many.
-        assert away.min() < (1e-9 if splits == (0, 0) else 0.15)
+        away = np.linalg.norm(points["point"] - place(pose, [x, y, -0.3]), axis=1)
+        # On faces of one another the place of a point is that of a column, one of many.
+        coarse, fine = (0.02, 0.2) if gap else (1e-9, 0.15)
+        assert away.min() < (coarse if splits == (0, 0) else fine)
+
+
+@pytest.mark.parametrize(("depth", "gap"), [(0.02, None), (-0.02, 0.03)])
+def test_edges_across_edges_push_along_their_cross_product(device, depth, gap):
+    bar, half = box(4, 0.5, 0.5), np.sqrt(0.125)
+    on_edge = quaternion_matrix(about((1, 0, 0), np.pi / 4))
+    across = to_matrix(quaternion_matrix(about((0, 0, 1), np.pi / 2)) @ on_edge, [0, 0, 2 * half - depth])
+    points = ask_points(device, (bar, to_matrix(on_edge, 0)), (bar, across), gap=gap)[1].points
+    check_upward(points)
+    assert points["depth"].max() == pytest.approx(depth, abs=1e-12 if gap else 1e-9)
+    assert np.abs(points["point"][:, :2]).max() < 0.05
 
 
 def test_equal_boxes_in_a_stack_push_upwards(device):
     cube = box(1, 1, 1)
     for shift in ((0, 0), (0.02, 0.01), (0.3, 0.0), (0.4, -0.4)):
-        points = ask(device, (cube, STILL), (cube, (*shift, 0.995, 0, 0, 0, 1)))[1].points
+        points = ask_points(device, (cube, STILL), (cube, (*shift, 0.995, 0, 0, 0, 1)))[1].points
         assert len(points["pair"]) >= 4
         check_upward(points)
         np.testing.assert_allclose(points["depth"], 0.005, atol=1e-9)
         np.testing.assert_allclose(np.ptp(points["point"][:, :2], axis=0), 1 - np.abs(shift), atol=1e-5)
-
-
-def test_edges_across_edges_push_along_their_cross_product(device):
-    bar, half = box(4, 0.5, 0.5), np.sqrt(0.125)
-    on_edge = quaternion_matrix(about((1, 0, 0), np.pi / 4))
-    across = to_matrix(quaternion_matrix(about((0, 0, 1), np.pi / 2)) @ on_edge, [0, 0, 2 * half - 0.02])
-    points = ask(device, (bar, to_matrix(on_edge, 0)), (bar, across))[1].points
-    check_upward(points)
-    assert points["depth"].max() == pytest.approx(0.02, abs=1e-9)
-    assert np.abs(points["point"][:, :2]).max() < 0.05
 
 
 def boxes_at(*placed):
@@ -93,7 +88,7 @@ def boxes_at(*placed):
 
 def test_a_corner_is_pushed_by_floor_and_walls_each_its_own_way(device):
     corner = boxes_at(((4, 4, 1), (0, 0, -0.5)), ((1, 4, 4), (-2.5, 0, 2)))
-    _, result = ask(device, (corner, STILL), (box(1, 1, 1), (-1.51, 0.1, 0.495, 0, 0, 0, 1)))
+    _, result = ask_points(device, (corner, STILL), (box(1, 1, 1), (-1.51, 0.1, 0.495, 0, 0, 0, 1)))
     normals = result.points["normal"]
     up, aside = np.abs(normals - [0, 0, 1]).max(1) < 1e-9, np.abs(normals - [1, 0, 0]).max(1) < 1e-9
     assert up.sum() >= 2 and aside.sum() >= 2
@@ -109,7 +104,7 @@ def test_a_loop_points_along_the_area_vector(device, splits):
     judged = 0
     for _ in range(25):
         poses = random_poses(rng, 2, 0.4)
-        query, result = ask(device, *zip(shapes, poses))
+        query, result = ask_points(device, *zip(shapes, poses))
         loops = query.curves.loop.numpy()[: result.count.sum()]
         area = clip_area_vector(halves[0], poses[0], halves[1], poses[1])
         if len(set(loops.tolist())) == 1 and np.linalg.norm(area) >= 1e-3:
@@ -124,7 +119,7 @@ def test_separate_contacts_are_separate_loops(device):
     legs = [(x, y) for x in (-1, 1) for y in (-1, 1)]
     table = boxes_at(*(((0.2, 0.2, 1), (x, y, 0.5)) for x, y in legs), ((3, 3, 0.2), (0, 0, 1.2)))
     tiles = boxes_at(*(((1.5, 1.5, 0.5), (x, y, -0.25)) for x, y in legs))
-    query, result = ask(device, (tiles, STILL), (table, (0, 0, -0.01, 0, 0, 0, 1)))
+    query, result = ask_points(device, (tiles, STILL), (table, (0, 0, -0.01, 0, 0, 0, 1)))
     assert len(set(query.curves.loop.numpy()[: result.count[0]].tolist())) == 4
     points = result.points
     assert len(points["pair"]) == 4, "legs are boxes: what lies between their outermost corners adds nothing"
@@ -137,7 +132,7 @@ def test_a_bar_that_jams_in_a_slot_is_pushed_by_each_wall_by_what_it_is_in_it(de
     """Its sides cross both walls: two loops on faces that they share."""
     slot = boxes_at(((1, 4, 4), (-1, 0, 0)), ((1, 4, 4), (1, 0, 0)))
     placed = [(slot, STILL), (box(1.02, 0.9, 0.8), (0.002, 0.1, 0.2, 0, 0, 0, 1))][::order]
-    query, result = ask(device, *placed)
+    query, result = ask_points(device, *placed)
     assert len(set(query.curves.loop.numpy()[: result.count[0]].tolist())) == 2
     normal, depth = order * result.points["normal"], result.points["depth"]
     for side in (1, -1):
@@ -170,12 +165,12 @@ def test_a_nut_is_no_deeper_in_its_thread_than_it_was_moved(device):
 
 def test_apart_inside_and_touching(device):
     cube, small, sheet = box(1, 1, 1), box(0.2, 0.2, 0.2), ([[-2, -2, 0], [2, -2, 0], [0, 3, 0.0]], [[0, 1, 2]])
-    _, inside = ask(device, (cube, STILL), (small, STILL), pairs=[(0, 1)])
+    _, inside = ask_points(device, (cube, STILL), (small, STILL), pairs=[(0, 1)])
     assert not inside.any[0] and len(inside.points["pair"]) == 0
-    _, touching = ask(device, (cube, STILL), (cube, (0, 0, 1, 0, 0, 0, 1)))
+    _, touching = ask_points(device, (cube, STILL), (cube, (0, 0, 1, 0, 0, 0, 1)))
     assert touching.any[0] and np.all(touching.points["depth"] == 0)
     check_upward(touching.points)
-    _, flat = ask(device, (ab.Model.from_arrays(*sheet), STILL), (small, (0, 0, 0.09, 0, 0, 0, 1)))
+    _, flat = ask_points(device, (ab.Model.from_arrays(*sheet), STILL), (small, (0, 0, 0.09, 0, 0, 0, 1)))
     check_upward(flat.points)
     np.testing.assert_allclose(flat.points["depth"], 0.01, atol=1e-9)
 
@@ -183,8 +178,8 @@ def test_apart_inside_and_touching(device):
 def test_a_pair_named_the_other_way_turns_its_normals(device):
     cube = box(1, 1, 1)
     placed = (cube, STILL), (cube, (0.3, 0.2, 0.9, *about((1, 2, 3), 0.4)))
-    forth = ask(device, *placed, pairs=[(0, 1)])[1].points
-    back = ask(device, *placed, pairs=[(1, 0)])[1].points
+    forth = ask_points(device, *placed, pairs=[(0, 1)])[1].points
+    back = ask_points(device, *placed, pairs=[(1, 0)])[1].points
     assert len(forth["pair"]) == len(back["pair"])
     np.testing.assert_allclose(np.sort(forth["depth"]), np.sort(back["depth"]), atol=1e-12)
     turned = [rows[np.lexsort(np.round(rows, 9).T)] for rows in (forth["normal"], -back["normal"])]
@@ -194,8 +189,8 @@ def test_a_pair_named_the_other_way_turns_its_normals(device):
 def test_room_grows_and_changes_nothing(device):
     rng = np.random.default_rng(1)
     placed = [(box(1, 0.8, 0.6, splits=1), pose) for pose in random_poses(rng, 12, 1.2)]
-    _, ample = ask(device, *placed, capacity=ab.Buffers(10_000, pairs=1000))
-    query, tight = ask(device, *placed, capacity=ab.Buffers(1, pairs=1))
+    _, ample = ask_points(device, *placed, capacity=ab.Buffers(10_000, pairs=1000))
+    query, tight = ask_points(device, *placed, capacity=ab.Buffers(1, pairs=1))
     assert tight.pairs.tolist() == ample.pairs.tolist() == sorted(ample.pairs.tolist())
     assert len(tight.points["pair"]) > 12
     query.launch()
@@ -211,7 +206,7 @@ def test_points_are_as_many_as_asked_for(device, most):
     cavity.invert()
     shell = ab.Model.from_arrays(cavity.vertices, cavity.faces)
     with pytest.warns(RuntimeWarning, match="inside out"):
-        points = ask(device, (model_of(ball), STILL), (shell, STILL), gap=0.02, points=most)[1].points
+        points = ask_points(device, (model_of(ball), STILL), (shell, STILL), gap=0.02, points=most)[1].points
     normals = points["normal"]
     assert most - 1 <= len(normals) <= most  # the last place is the deepest's, if it is deeper
     seen = (normals @ np.asarray(ball.vertices).T).max(0).min()  # cosine of the emptiest cap
@@ -259,7 +254,7 @@ def test_points_are_those_of_a_plain_choice(device, gap, most):
     for k, height in enumerate((0.1, 0.2, 0.33)):
         shifts = (0, 0, 0), (0.3, 0.1, height)
         placed = [(torus, (*shift, *about((1, 2, k), 0.5 + j + k))) for j, shift in enumerate(shifts)]
-        query, result = ask(device, *placed, gap=gap, points=most)
+        query, result = ask_points(device, *placed, gap=gap, points=most)
         count, curves, along = query.start.numpy()[1], query.curves, [0.6134, 0.5327, 0.5831]
         depth = curves.depth.numpy()[:count]
         i = np.nonzero(~np.isnan(depth))
@@ -274,5 +269,4 @@ def test_points_are_those_of_a_plain_choice(device, gap, most):
 
 def test_numbers_of_points_that_are_none_are_refused(device):
     for points in (0, 65, 2.5, "8"):
-        with pytest.raises(ValueError, match="points"):
-            ab.ManifoldQuery(ab.Scene(device), points=points)
+        refused(ValueError, "points", ab.ManifoldQuery, ab.Scene(device), points=points)

@@ -1,12 +1,24 @@
-"""Distances of object pairs: against brute force, the exact test, and what must not change an answer."""
+"""Distances of object pairs: against brute force, the exact test, what must not change an answer, and by graphs."""
 
 import itertools
 
 import numpy as np
 import pytest
-import warp as wp
-from helpers.questions import in_a_row, pairs_of, random_case, random_lod, scene_of
-from helpers.samples import SHAPES, contact_poses, random_poses, sample
+from helpers import refused
+from helpers.questions import (
+    captured,
+    far_cases,
+    in_a_row,
+    pairs_of,
+    parted_cases,
+    random_case,
+    random_lod,
+    scale_cases,
+    scene_of,
+    to_matrix,
+)
+from helpers.samples import random_poses, sample
+from helpers.scenes import scene_with
 from oracles.distance import mesh_distance
 from oracles.triangle import quaternion_matrix, triangles_intersect
 
@@ -15,16 +27,6 @@ from warp_abtree import testing
 
 NAMES = ("box", "small ball", "crumbs", "soup", "torus", "three", "capsule", "one", "lattice soup", "twins")
 ANSWERS = ("distance", "bracket", "points", "point_faces")
-FACES = 60
-
-
-def make_cases(rng, pairs, faces=FACES, away=0.7):
-    """Return cases of pairs of samples in contact or moved apart."""
-    cases = [random_case(rng, names, faces) for names in pairs]
-    for case in cases:
-        direction = rng.normal(size=3)
-        case[5][:3] += (2 * rng.random()) * direction / np.linalg.norm(direction) * (rng.random() < away)
-    return cases
 
 
 def to_bytes(result, names=ANSWERS):
@@ -51,7 +53,7 @@ def check_points(result, cases):
 
 def test_equals_brute_force(device):
     rng = np.random.default_rng(1)
-    cases = make_cases(rng, [tuple(rng.choice(NAMES, 2)) for _ in range(120)])
+    cases = parted_cases(rng, [tuple(rng.choice(NAMES, 2)) for _ in range(120)])
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     result = scene.intersect(pairs, "distance")
     np.testing.assert_array_equal(result.any, scene.intersect(pairs).any)
@@ -69,8 +71,7 @@ def test_equals_brute_force(device):
 
 
 def test_order_of_objects_mirrors_the_answer(device):
-    rng = np.random.default_rng(2)
-    cases = make_cases(rng, [("torus", "soup"), ("box", "crumbs")] * 15)
+    cases = parted_cases(np.random.default_rng(2), [("torus", "soup"), ("box", "crumbs")] * 15)
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     one, other = (scene.intersect(p, "distance") for p in (pairs, pairs[:, ::-1]))
     assert to_bytes(one, ["distance", "bracket"]) == to_bytes(other, ["distance", "bracket"])
@@ -84,17 +85,15 @@ def test_order_of_objects_mirrors_the_answer(device):
 
 def test_common_motion_stays_within_brackets(device):
     rng = np.random.default_rng(3)
-    cases = make_cases(rng, [("torus", "capsule")] * 30)
+    cases = parted_cases(rng, [("torus", "capsule")] * 30)
     first = scene_of(device, cases).intersect(pairs_of(cases), "distance")
     for move in random_poses(rng, 4, 3.0):
         moved = []
         for model_a, lod_a, pose_a, model_b, lod_b, pose_b in cases:
             poses = []
+            turn = quaternion_matrix(move[3:])
             for pose in (pose_a, pose_b):
-                matrix = np.eye(4)
-                matrix[:3, :3] = quaternion_matrix(move[3:]) @ quaternion_matrix(pose[3:])
-                matrix[:3, 3] = quaternion_matrix(move[3:]) @ pose[:3] + move[:3]
-                poses.append(matrix)
+                poses.append(to_matrix(turn @ quaternion_matrix(pose[3:]), turn @ pose[:3] + move[:3]))
             moved.append((model_a, lod_a, poses[0], model_b, lod_b, poses[1]))
         found = scene_of(device, moved).intersect(pairs_of(cases), "distance")
         assert (found.bracket[:, 0] <= first.bracket[:, 1] + 1e-14).all()
@@ -103,13 +102,9 @@ def test_common_motion_stays_within_brackets(device):
 
 @pytest.mark.parametrize("exponent", [-60, 31])
 def test_scaling_by_a_power_of_two_scales_the_answer(device, exponent):
-    rng = np.random.default_rng(5)
-    cases = make_cases(rng, [("soup", "small ball")] * 20)
-    meshes = SHAPES["soup"](), SHAPES["small ball"]()
-    a, b = (ab.Model.from_arrays(np.ldexp(points, exponent), faces, base_faces=4) for points, faces in meshes)
-    by = np.array([2.0**exponent] * 3 + [1] * 4)
-    scaled = [(a, i, by * p, b, j, by * q) for _, i, p, _, j, q in cases]
-    one, other = (scene_of(device, some).intersect(pairs_of(cases), "distance") for some in (cases, scaled))
+    cases = parted_cases(np.random.default_rng(5), [("soup", "small ball")] * 20)
+    both = cases, scale_cases(cases, exponent)
+    one, other = (scene_of(device, some).intersect(pairs_of(cases), "distance") for some in both)
     np.testing.assert_array_equal(one.point_faces, other.point_faces)
     for name in ("distance", "bracket", "points"):
         np.testing.assert_array_equal(np.ldexp(getattr(one, name), exponent), getattr(other, name))
@@ -134,16 +129,7 @@ def test_distances_beyond_float64(device):
 
 def test_far_from_the_origin(device):
     """Coordinates far from their own origin, and objects far away: brackets grow in proportion and hold."""
-    rng = np.random.default_rng(6)
-    shift = np.array([1e6, -1e6, 3e5, 0, 0, 0, 0])
-    vertices, faces, _ = sample("small ball").mesh_at(sample("small ball").lod_max)
-    moved = ab.Model.from_arrays(vertices + shift[:3], faces, base_faces=4)
-    cases = []
-    for model in (sample("torus"), moved) * 10:
-        a, b = (model, random_lod(rng, model, FACES)), (sample("soup"), 40)
-        pose_a, pose_b = contact_poses(rng, *a, *b)
-        pose_b[:3] += 3 * rng.normal(size=3)
-        cases.append((*a, pose_a + shift, *b, pose_b + shift))
+    cases = far_cases(np.random.default_rng(6), 1e6)
     result = scene_of(device, cases).intersect(pairs_of(cases), "distance")
     truth = true_distances(cases, result.any)
     lower, upper = result.bracket.T
@@ -165,8 +151,7 @@ def check_tolerance(exact, found, tolerances):
 
 @pytest.mark.parametrize("tolerances", TOLERANCES)
 def test_tolerance_is_the_width_of_the_bracket(device, tolerances):
-    rng = np.random.default_rng(7)
-    cases = make_cases(rng, [("torus", "ball"), ("soup", "capsule")] * 20, faces=300)
+    cases = parted_cases(np.random.default_rng(7), [("torus", "ball"), ("soup", "capsule")] * 20, faces=300)
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     check_tolerance(scene.intersect(pairs, "distance"), scene.intersect(pairs, "distance", **tolerances), tolerances)
     fresh = [ab.DistanceQuery(scene, pairs, **options).run() for options in ({}, tolerances)]
@@ -177,7 +162,7 @@ def test_tolerance_is_the_width_of_the_bracket(device, tolerances):
 def test_many_pairs_within_a_tolerance(device, tolerances):
     """So many that warps search each roughly first: what bounds a distance then is not lost."""
     rng = np.random.default_rng(16)
-    cases = make_cases(rng, [("torus", "ball"), ("soup", "capsule")] * 20, faces=150)
+    cases = parted_cases(rng, [("torus", "ball"), ("soup", "capsule")] * 20, faces=150)
     scene, pairs = scene_of(device, cases), np.tile(pairs_of(cases), (30, 1))
     exact = scene.intersect(pairs, "distance")
     with testing.regime(warps=True):
@@ -191,8 +176,7 @@ def test_many_pairs_within_a_tolerance(device, tolerances):
 
 
 def test_beyond_ends_a_pair_that_is_farther(device):
-    rng = np.random.default_rng(8)
-    cases = make_cases(rng, [("torus", "ball"), ("soup", "capsule")] * 25)
+    cases = parted_cases(np.random.default_rng(8), [("torus", "ball"), ("soup", "capsule")] * 25)
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     exact = scene.intersect(pairs, "distance")
     for beyond in (0.0, 0.25, 0.7 * exact.distance, exact.distance * (1 - 1e-11), exact.distance * (1 + 1e-11)):
@@ -209,7 +193,7 @@ def test_beyond_ends_a_pair_that_is_farther(device):
 def test_what_a_search_starts_from_changes_nothing(device):
     """Faces of other poses, of other LODs, some inactive now, and of other pairs."""
     rng = np.random.default_rng(9)
-    cases = make_cases(rng, [("torus", "ball"), ("soup", "capsule")] * 15, faces=300)
+    cases = parted_cases(rng, [("torus", "ball"), ("soup", "capsule")] * 15, faces=300)
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     query = ab.DistanceQuery(scene, pairs)
     query.run()
@@ -229,10 +213,7 @@ def test_what_a_search_starts_from_changes_nothing(device):
 
 def test_equally_near_faces_give_the_lowest(device):
     """Flat sheets over one another, and closed boxes: very many pairs of faces are as near."""
-    scene = ab.Scene(device)
-    for name in ("grid", "box"):
-        scene.add(sample(name))
-        scene.add(sample(name), (0, 0, 2, 0, 0, 0, 1))
+    scene = scene_with(device, *[(sample(n), (0, 0, z, 0, 0, 0, 1)) for n in ("grid", "box") for z in (0, 2)])
     for a, b in ((0, 1), (2, 3)):
         found = scene.intersect([(a, b), (b, a)], "distance")
         vertices, faces, _ = (model := scene.models[scene.object_model[a]]).mesh_at(model.lod_max)
@@ -254,33 +235,6 @@ def flattened(corners, level):
     """Return what of a triangle lies at a height, as a triangle at height 0: itself, an edge or a corner."""
     kept = corners[corners[:, 2] == level] * [1, 1, 0]
     return np.concatenate([kept, kept[-1:].repeat(3 - len(kept), 0)])
-
-
-def test_captured_graphs(device):
-    query, _ = small_query(device)
-    expected = to_bytes(query.result())
-    with wp.ScopedCapture(query.device) as capture:
-        query.launch()
-    query.distances.distance.fill_(7.0)
-    wp.capture_launch(capture.graph)
-    assert to_bytes(query.result()) == expected
-
-
-def small_query(device):
-    rng = np.random.default_rng(10)
-    cases = make_cases(rng, [("torus", "ball"), ("soup", "capsule")] * 10)
-    query = ab.DistanceQuery(scene_of(device, cases), pairs_of(cases))
-    query.run()
-    return query, cases
-
-
-def test_results_on_the_device(device):
-    query, _ = small_query(device)
-    host, kept = query.result(), query.result(device=True)
-    for name in ANSWERS:
-        array = getattr(kept, name)
-        assert isinstance(array, wp.array) and array.device == query.device
-        np.testing.assert_array_equal(array.numpy(), getattr(host, name))
 
 
 def test_no_pairs_and_the_broad_phase(device):
@@ -315,15 +269,9 @@ def test_sweeps(device):
     kept = found["distance"] <= 0.5
     assert (ended["bracket"][kept, 1] - ended["bracket"][kept, 0]).max() < 1.001e-3
     assert ab.sweep(a, b, np.empty((0, 7)), **asked)["points"].shape == (0, 2, 3)
-    for options, error in (
-        ({"beyond": -1}, ValueError),
-        ({"tolerance": np.nan}, ValueError),
-        ({"within": 1}, ValueError),
-    ):
-        with pytest.raises(error, match=next(iter(options))):
-            ab.sweep(a, b, poses, **asked, **options)
-    with pytest.raises(ValueError, match="beyond means nothing"):
-        ab.sweep(a, b, poses, device=device, beyond=1.0)
+    for options in ({"beyond": -1}, {"tolerance": np.nan}, {"within": 1}):
+        refused(ValueError, next(iter(options)), ab.sweep, a, b, poses, **asked, **options)
+    refused(ValueError, "beyond means nothing", ab.sweep, a, b, poses, device=device, beyond=1.0)
 
 
 def test_bad_input(device):
@@ -337,48 +285,97 @@ def test_bad_input(device):
             lambda options=options: scene.intersect(pairs, "distance", **options),
             lambda options=options: ab.DistanceQuery(scene, pairs, **options),
         ):
-            with pytest.raises(ValueError, match=next(iter(options))):
-                ask()
-    with pytest.raises(ValueError, match="within means nothing"):
-        scene.intersect(pairs, "distance", within=1.0)
-    with pytest.raises(ValueError, match="beyond means nothing"):
-        scene.intersect(pairs, "any", beyond=1.0)
-    with pytest.raises(ValueError, match="precision"):
-        scene.intersect(pairs, "distance", precision="float32")
-    with pytest.raises(ValueError, match="DistanceQuery"):
-        ab.Query(scene, "distance")
+            refused(ValueError, next(iter(options)), ask)
+    refused(ValueError, "within means nothing", scene.intersect, pairs, "distance", within=1.0)
+    refused(ValueError, "beyond means nothing", scene.intersect, pairs, "any", beyond=1.0)
+    refused(ValueError, "precision", scene.intersect, pairs, "distance", precision="float32")
+    refused(ValueError, "DistanceQuery", ab.Query, scene, "distance")
     assert scene.intersect(pairs, "distance").distance[0] == 2
 
 
-def test_frames_off_orthonormal(device):
-    """Rotations off by nearly what scenes refuse: distances of the posed meshes stay within their brackets."""
-    rng = np.random.default_rng(12)
-    box = sample("box")
-    vertices = box.mesh_at(box.lod_max)[0]
-    for _ in range(20):
-        matrices = []
-        for place in ([0.0, 0, 0], [4.0, 0.3, -0.2]):
-            matrix = np.eye(4)
-            matrix[:3, :3] = quaternion_matrix(random_poses(rng, 1, 1)[0, 3:]) + rng.uniform(-2e-7, 2e-7, (3, 3))
-            matrix[:3, 3] = place
-            matrices.append(matrix)
-        scene = ab.Scene(device)
-        for matrix in matrices:
-            scene.add(box, matrix)
-        lower, upper = scene.intersect([(0, 1)], "distance").bracket[0]
-        posed = [ab.Model.from_arrays(vertices @ m[:3, :3].T + m[:3, 3], box.mesh_at(box.lod_max)[1]) for m in matrices]
-        still = scene_of(device, [(posed[0], None, (0, 0, 0, 0, 0, 0, 1), posed[1], None, (0, 0, 0, 0, 0, 0, 1))])
-        truth = still.intersect([(0, 1)], "distance").distance[0]
-        assert lower - 1e-14 <= truth <= upper + 1e-14
-        assert upper - lower < 1e-4
+@pytest.mark.parametrize("options", [{}, {"originals": True}, {"originals": True, "tolerance": 5.0}], ids=str)
+def test_frames_off_orthonormal(device, options):
+    """Rotations off by nearly what scenes refuse: brackets hold the distances of posed meshes, of LODs or originals."""
+    rng, model = np.random.default_rng(8), sample("torus")
+    scene, posed = ab.Scene(device), ab.Scene(device)
+    vertices, faces, _ = model.mesh_at(model.lod_max)
+    for i in range(20):
+        skew = quaternion_matrix(random_poses(rng, 1, 1)[0, 3:]) + rng.uniform(-2e-7, 2e-7, (3, 3))
+        place = np.array([3.0 * i, 0.3 * (i % 2), 0])
+        scene.add(model, to_matrix(skew, place), lod=model.lod_for(fraction=0.3) if options else None)
+        posed.add(ab.Model.from_arrays(vertices @ skew.T + place, faces))
+    pairs = np.stack([np.arange(19), np.arange(1, 20)], 1)
+    truth = posed.intersect(pairs, "distance").distance
+    lower, upper = scene.intersect(pairs, "distance", **options).bracket.T
+    assert (lower - 1e-14 <= truth).all() and (truth <= upper + 1e-14).all()
+    assert "tolerance" in options or (upper - lower < 1e-4).all()
 
 
 @pytest.mark.slow
 def test_regimes_agree(device):
-    rng = np.random.default_rng(11)
-    cases = make_cases(rng, [("torus", "ball"), ("soup", "capsule")] * 15, faces=400)
+    cases = parted_cases(np.random.default_rng(11), [("torus", "ball"), ("soup", "capsule")] * 15, faces=400)
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     expected = ab.DistanceQuery(scene, pairs).run()
     for warps, length in itertools.product((True,) if scene.device.is_cuda else (False, True), (None, 140)):
         with testing.regime(warps=warps, stack_length=length, cpu_threads=1 if length else 4):
             assert to_bytes(ab.DistanceQuery(scene, pairs).run()) == to_bytes(expected)
+
+
+PAIRED = ("torus", "ball"), ("soup", "capsule"), ("twins", "lattice soup"), ("box", "crumbs")
+
+
+def make_turns(rng, device, count):
+    """Return a scene, and poses and pairs of a number of turns: many surfaces intersect, many faces are as near."""
+    cases = [random_case(rng, names, 60) for names in PAIRED * 4]
+    identity = np.array([0.0, 0, 0, 0, 0, 0, 1])
+    cases += [(sample(name), None, identity) * 2 for name in ("box", "grid")] * 3
+    start = np.array([pose for case in cases for pose in (case[2], case[5])])
+    turns = []
+    for _ in range(count):
+        poses = start.copy()
+        poses[:-12, :3] += 0.3 * rng.normal(size=(len(poses) - 12, 3))
+        # On a lattice, through one another or apart.
+        poses[-12:, :3] = rng.integers(-4, 5, (12, 3)) / 8
+        poses[-11::2, 2] += rng.choice([0, 2, 3], 6)
+        pairs = rng.permutation(pairs_of(cases))
+        turns.append((poses, np.where(rng.random(len(pairs))[:, None] < 0.5, pairs, pairs[:, ::-1])))
+    return scene_of(device, cases), turns
+
+
+@pytest.mark.parametrize("warps", [True, False])
+def test_a_graph_answers_what_is_in_place(device, warps):
+    """Captured before there was a launch; and calls one after the other, from the fourth on a graph on a GPU."""
+    scene, turns = make_turns(np.random.default_rng(15), device, 8)
+    if scene.device.is_cuda and not warps:
+        pytest.skip("CUDA has warps alone")
+    met = []
+    with testing.regime(warps=warps):
+        first, called = (ab.DistanceQuery(scene, turns[0][1][::-1]) for _ in range(2))
+        replay = captured(first)
+        for poses, pairs in turns:
+            scene.set_poses(poses)
+            expected = ab.DistanceQuery(scene, pairs).run()
+            for query in (first, called):
+                query.set_pairs(pairs)
+            replay()
+            assert to_bytes(first.result()) == to_bytes(expected)
+            assert to_bytes(called.run()) == to_bytes(expected)
+            met.append(expected.any.mean())
+    assert 0.2 < np.mean(met) < 0.8
+
+
+def test_graphs_captured_first_and_stale_ones(device):
+    """The first launch may be that of a graph; one whose tree states were replaced is refused, a new one is not."""
+    rng = np.random.default_rng(14)
+    cases = [random_case(rng, ("torus", "ball"), 60) for _ in range(4)]
+    scene, pairs = scene_of(device, cases), pairs_of(cases)
+    query = ab.DistanceQuery(scene, pairs)
+    for turn in range(2):
+        replay = captured(query)
+        for _ in range(3):
+            replay()
+        assert to_bytes(query.result()) == to_bytes(ab.DistanceQuery(scene, pairs).run())
+        scene.set_lods([model.lod_max - 5 * i - 7 * turn for i, model in enumerate(scene.models * 4)])
+        replay()
+        if turn == 0:
+            refused(RuntimeError, "captured before arrays that it uses were replaced", query.result)

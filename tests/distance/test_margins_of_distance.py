@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from helpers.questions import pairs_of, random_lod, scene_of, to_matrix
-from helpers.samples import grid, random_poses, random_quaternions, sample
-from oracles.distance import surface_distance
-from oracles.triangle import into_frame_of_a, quaternion_matrix
+from helpers.samples import STILL, grid, random_poses, random_quaternions, sample
+from oracles.distance import mesh_distance
+from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree import testing
@@ -14,42 +14,30 @@ from warp_abtree.kernels.base.poses import ROUNDING_32
 from warp_abtree.kernels.distance.frame import PAIRS_LEAST
 from warp_abtree.kernels.distance.slab_bound import BOUND_MARGINS
 
-STILL = (0, 0, 0, 0, 0, 0, 1)
 ANSWERS = ("distance", "bracket", "points", "point_faces")
 
 
-# Corners of A and of B, B's quaternion, and how far the first corners are apart: slabs' roundings add up to 5.4 times
-# u (r_a + r_b + s) for warps, to 4.2 times that on a CPU, of 45 that margins have.
-ROUNDED = [
-    (
-        [
-            [-0.0063452670170715, 0.006495436896775595, -0.003366734468144777],
-            [-0.011223352340720298, 0.0028906581802885353, -0.0031412251042453746],
-            [-0.010965733792827123, 0.0015656533173187379, -0.002161921759568002],
-        ],
-        [
-            [-0.8418633340994, 0.4955881816668027, 1.9747835396765856],
-            [-0.15469808320047174, 0.246982734107978, -0.49405666572617807],
-            [0.8368920059023238, -0.938772821034292, -1.0660586309026445],
-        ],
-        [0.7220642233492901, -0.3959232800579053, -0.987666057400544, 0.7721717006863813],
-        [4.903547460711388e-07, -3.048028864489987e-08, -4.645371978133124e-07],
-    ),
-    (
-        [
-            [-0.07835333056226623, -0.04156394784183524, 0.016411565058202154],
-            [-0.10877598235906367, -0.04500907586634343, -0.007771817244874567],
-            [-0.08999167518814356, -0.07509105506312413, -0.0025541332151526744],
-        ],
-        [
-            [0.4100274887918493, 0.2983457445508492, -0.3335259854563965],
-            [0.14144962243683004, 0.10887864875509415, 0.008037718427744273],
-            [0.03330987125751328, -0.23660277730000032, -0.018759052129049186],
-        ],
-        [0.31006069285811616, -1.4721559474149521, -1.1559079557234815, -0.7234266875990177],
-        [3.7854399816146004e-08, 4.116893343448102e-09, -2.540862579941426e-09],
-    ),
-]
+# Rows: corners of A and of B, B's quaternion, and how far the first corners are apart: slabs' roundings add up to 5.4
+# times u (r_a + r_b + s) for warps, to 4.2 times that on a CPU, of 45 that margins have.
+ROUNDED = """
+-0.0063452670170715 0.006495436896775595 -0.003366734468144777
+-0.011223352340720298 0.0028906581802885353 -0.0031412251042453746
+-0.010965733792827123 0.0015656533173187379 -0.002161921759568002
+-0.8418633340994 0.4955881816668027 1.9747835396765856
+-0.15469808320047174 0.246982734107978 -0.49405666572617807
+0.8368920059023238 -0.938772821034292 -1.0660586309026445
+0.7220642233492901 -0.3959232800579053 -0.987666057400544 0.7721717006863813
+4.903547460711388e-07 -3.048028864489987e-08 -4.645371978133124e-07
+
+-0.07835333056226623 -0.04156394784183524 0.016411565058202154
+-0.10877598235906367 -0.04500907586634343 -0.007771817244874567
+-0.08999167518814356 -0.07509105506312413 -0.0025541332151526744
+0.4100274887918493 0.2983457445508492 -0.3335259854563965
+0.14144962243683004 0.10887864875509415 0.008037718427744273
+0.03330987125751328 -0.23660277730000032 -0.018759052129049186
+0.31006069285811616 -1.4721559474149521 -1.1559079557234815 -0.7234266875990177
+3.7854399816146004e-08 4.116893343448102e-09 -2.540862579941426e-09
+"""
 
 
 def to_bytes(result):
@@ -108,20 +96,14 @@ def test_nearly_equally_near_faces_of_large_objects(device, roughness, far, asid
 
 def check_sheets(device, sheets, size):
     """Compare with brute force, without slabs, with slabs from the start, and from the answer; threads and warps."""
-    cases = [(a, None, pose_a, b, None, pose_b) for (a, b), (pose_a, pose_b) in sheets]
+    cases = [(a, a.lod_max, pose_a, b, b.lod_max, pose_b) for (a, b), (pose_a, pose_b) in sheets]
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     # So many that warps, too, make slabs of them.
     pairs = np.tile(pairs, (-(-int(PAIRS_LEAST) // len(pairs)), 1))
-    truths = [true_distance(case) for case in cases]
+    truths = [mesh_distance(*case) for case in cases]
     for warps in (None, True):
         with testing.regime(warps=warps):
             check_queries(ab.DistanceQuery(scene, pairs), truths, size)
-
-
-def true_distance(case):
-    a, _, pose_a, b, _, pose_b = case
-    (vertices_a, faces_a, _), (vertices_b, faces_b, _) = a.mesh_at(a.lod_max), b.mesh_at(b.lod_max)
-    return surface_distance(vertices_a[faces_a], into_frame_of_a(vertices_b, pose_a, pose_b)[faces_b])
 
 
 def check_queries(query, truths, size):
@@ -198,13 +180,16 @@ def test_tolerances_whatever_the_search_starts_from(device):
 @pytest.mark.parametrize("case", [0, 1], ids=["warps", "threads"])
 def test_margins_of_slabs_cover_roundings_that_add_up(device, case):
     """Beside its mirror image in the origin each face is one of two, so that slabs of nodes are compared."""
-    *faces, quaternion, apart = map(np.array, ROUNDED[case])
+    *corners, quaternion, apart = (
+        np.array(row.split(), float) for row in ROUNDED.strip().split("\n\n")[case].split("\n")
+    )
+    faces = np.reshape(corners, (2, 3, 3))
     rotation = quaternion_matrix(quaternion)
     pose = to_matrix(rotation, faces[0][0] - rotation @ faces[1][0] + apart)
     a, b = (ab.Model.from_arrays(np.concatenate([face, -face]), [[0, 1, 2], [3, 4, 5]]) for face in faces)
     scene = scene_of(device, [(a, None, STILL, b, None, pose)])
     pairs = [(0, 1)] * int(PAIRS_LEAST)
-    distance = true_distance((a, None, STILL, b, None, pose))
+    distance = mesh_distance(a, a.lod_max, STILL, b, b.lod_max, pose)
     for warps in (None, True):
         with testing.regime(warps=warps):
             query = ab.DistanceQuery(scene, pairs, beyond=distance * (1 + 1e-9))

@@ -3,25 +3,16 @@
 import numpy as np
 import pytest
 from helpers.questions import pairs_of, scene_of
-from helpers.samples import random_poses, sample
+from helpers.samples import STILL, random_poses, sample
+from oracles.peers import fcl_object
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
 
 fcl = pytest.importorskip("fcl")
 
-STILL = (0, 0, 0, 0, 0, 0, 1)
 PAIRS = (("cow", "rocker-arm"), ("fandisk", "cow"), ("stanford-bunny", "fandisk"), ("fcl-env", "fcl-rob"))
 POSES = 500
-
-
-def fcl_tree(model):
-    vertices, faces, _ = model.mesh_at(model.lod_max)
-    tree = fcl.BVHModel()
-    tree.beginModel(len(vertices), len(faces))
-    tree.addSubModel(vertices, faces)
-    tree.endModel()
-    return tree
 
 
 def place_about(a, b, poses):
@@ -34,19 +25,17 @@ def place_about(a, b, poses):
 @pytest.mark.slow
 @pytest.mark.parametrize("names", PAIRS, ids="-".join)
 def test_equals_fcl(device, names):
-    rng = np.random.default_rng(1)
     a, b = map(sample, names)
-    poses = place_about(a, b, random_poses(rng, POSES, 1.5))
+    poses = place_about(a, b, random_poses(np.random.default_rng(1), POSES, 1.5))
     scene = scene_of(device, [(a, None, STILL, b, None, pose) for pose in poses])
     pairs = np.arange(2 * POSES).reshape(-1, 2)
     query = ab.DistanceQuery(scene, pairs)
     result = query.run()
     np.testing.assert_array_equal(result.distance == 0, scene.intersect(pairs).any)
-    trees = fcl_tree(a), fcl_tree(b)
-    still = fcl.CollisionObject(trees[0], fcl.Transform())
+    still, other = (fcl_object(*model.mesh_at(model.lod_max)[:2]) for model in (a, b))
     truth = []
     for pose in poses:
-        other = fcl.CollisionObject(trees[1], fcl.Transform(quaternion_matrix(pose[3:]), pose[:3]))
+        other.setTransform(fcl.Transform(quaternion_matrix(pose[3:]), pose[:3]))
         truth.append(max(0.0, fcl.distance(still, other, fcl.DistanceRequest(), fcl.DistanceResult())))
     truth, apart = np.array(truth), ~result.any
     assert 20 < apart.sum() and result.any.any()
@@ -66,10 +55,9 @@ def test_equals_fcl(device, names):
 
 @pytest.mark.slow
 def test_coarse_levels_are_answered_as_meshes_of_their_own(device):
-    rng = np.random.default_rng(2)
     model = sample("stanford-bunny")
     lods = [model.lod_for(fraction=f) for f in (0.1, 0.01)]
-    poses = place_about(model, model, random_poses(rng, 60, 1.5))
+    poses = place_about(model, model, random_poses(np.random.default_rng(2), 60, 1.5))
     cases = [(model, lods[0], STILL, model, lods[1], pose) for pose in poses]
     meshes = [ab.Model.from_arrays(*model.mesh_at(lod)[:2], base_faces=10**6) for lod in lods]
     others = [(meshes[0], None, STILL, meshes[1], None, pose) for pose in poses]

@@ -1,9 +1,10 @@
-"""Bodies, models and scenes that tests of motion and of LOD selection start from."""
+"""Bodies, models and scenes that tests of motion and of LOD selection start from; contacts in Newton."""
 
 from functools import cache
 
 import numpy as np
 import trimesh
+import warp as wp
 
 import warp_abtree as ab
 
@@ -80,3 +81,46 @@ def strewn(count, device):
         pose = np.concatenate([rng.uniform(-4, 4, 3), turn / np.linalg.norm(turn)])
         scene.add(models[i % len(models)], pose, importance=1 + i // len(models) % 3)
     return scene
+
+
+def newton_mesh(shape):
+    import newton
+
+    return newton.Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces, np.int32).ravel())
+
+
+def at(x=0.0, y=0.0, z=0.0, axis=(0, 0, 1), angle=0.0):
+    """Return a place of Newton's bodies and shapes."""
+    return wp.transform((x, y, z), about(axis, angle))
+
+
+def collided(model, **options):
+    """Return the state of a model of Newton, what finds its contacts, and those at its poses."""
+    state, found = model.state(), ab.NewtonContacts(model, **options)
+    contacts = found.contacts()
+    found.collide(state, contacts)
+    return state, found, contacts
+
+
+def contact_rows(contacts, *names):
+    """Return columns of the rigid contacts that Newton has."""
+    count = int(contacts.rigid_contact_count.numpy()[0])
+    return [getattr(contacts, f"rigid_contact_{name}").numpy()[:count].copy() for name in names]
+
+
+def touching_shapes(contacts):
+    return {tuple(sorted(pair)) for pair in np.stack(contact_rows(contacts, "shape0", "shape1"), 1).tolist()}
+
+
+def settle(model, found, steps, iterations=2):
+    """Step bodies by a solver of Newton's; return their poses and the last contacts."""
+    import newton
+
+    state, after, control, contacts = model.state(), model.state(), model.control(), found.contacts()
+    solver = newton.solvers.SolverXPBD(model, iterations=iterations)
+    for _ in range(steps):
+        state.clear_forces()
+        found.collide(state, contacts)
+        solver.step(state, after, control, contacts, 1 / 240)
+        state, after = after, state
+    return state.body_q.numpy(), contacts

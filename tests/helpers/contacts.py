@@ -5,6 +5,9 @@ from fractions import Fraction
 import numpy as np
 from oracles.triangle import cross, dot, sub
 
+import warp_abtree as ab
+from helpers.scenes import scene_with
+
 CHUNK = 32  # contacts that are summed from left to right before sums are; part of the definition
 
 
@@ -89,3 +92,19 @@ def check_summaries(result):
         assert 0 <= got["travel"] and (depth is None or got["travel"] <= depth)
         curves += got["travel"] == depth
     return curves
+
+
+def check_mirrored(rows, swapped):
+    """Check that contacts are those of the same pairs named the other way, in their order."""
+    rows = rows[np.lexsort((*rows["faces"].T, rows["pair"]))]
+    np.testing.assert_array_equal(swapped["faces"], rows["faces"][:, ::-1])
+    np.testing.assert_array_equal(swapped["normal"], -rows["normal"])
+    other = {"p0": "p1", "p1": "p0", "normal_a": "normal_b", "normal_b": "normal_a"}
+    for name in set(rows.dtype.names) - {"faces", "normal"}:
+        np.testing.assert_array_equal(swapped[name], rows[other.get(name, name)])
+
+
+def ask_points(device, *placed, **options):
+    """Return the query of contact points in a scene of (model, pose), and what it finds."""
+    query = ab.ManifoldQuery(scene_with(device, *placed), **options)
+    return query, query.run()

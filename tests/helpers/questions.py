@@ -7,7 +7,8 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
-from helpers.samples import contact_poses, sample
+from helpers.samples import SHAPES, contact_poses, sample
+from helpers.scenes import scene_with
 from warp_abtree import testing
 
 SIGNS = itertools.product((1.0, -1.0), repeat=3)
@@ -60,9 +61,7 @@ def ask(device, cases, **options):
 
 def in_a_row(device, name, places):
     """Return a scene of copies of a sample at places along x."""
-    scene = ab.Scene(device)
-    for x in places:
-        scene.add(sample(name), (x, 0, 0, 0, 0, 0, 1))
+    scene = scene_with(device, *[(sample(name), (x, 0, 0, 0, 0, 0, 1)) for x in places])
     return scene
 
 
@@ -92,3 +91,41 @@ def coarse(name, faces=500):
     """Return vertices and faces of a sample at a modest LOD."""
     model = sample(name)
     return model.mesh_at(model.lod_for(fraction=min(1.0, faces / model.face_count)))[:2]
+
+
+def captured(operator, *arguments):
+    """Capture a launch of an operator; return a function that replays it."""
+    with wp.ScopedCapture(operator.device) as capture:
+        operator.launch(*arguments)
+    return lambda: wp.capture_launch(capture.graph)
+
+
+def parted_cases(rng, names, faces=60, least=0.0):
+    """Return a case for each pair of samples: in contact, but seven of ten moved by `least` up to 2 more."""
+    cases = [random_case(rng, pair, faces) for pair in names]
+    for case in cases:
+        away = rng.normal(size=3)
+        case[5][:3] += (least + 2 * rng.random()) * away / np.linalg.norm(away) * (rng.random() < 0.7)
+    return cases
+
+
+def scale_cases(cases, exponent):
+    """Return cases of ("soup", "small ball") scaled by a power of two."""
+    meshes = SHAPES["soup"](), SHAPES["small ball"]()
+    a, b = (ab.Model.from_arrays(np.ldexp(points, exponent), faces, base_faces=4) for points, faces in meshes)
+    by = np.array([2.0**exponent] * 3 + [1] * 4)
+    return [(a, i, by * p, b, j, by * q) for _, i, p, _, j, q in cases]
+
+
+def far_cases(rng, far):
+    """Return cases far from the origin, of a mesh with coordinates far from its own origin too."""
+    shift = np.array([far, -far, 0.3 * far, 0, 0, 0, 0])
+    vertices, faces, _ = sample("small ball").mesh_at(sample("small ball").lod_max)
+    models = sample("torus"), ab.Model.from_arrays(vertices + shift[:3], faces, base_faces=4)
+    cases = []
+    for k in range(20):
+        a, b = [(models[k % 2], random_lod(rng, models[k % 2], 60)), (sample("soup"), 40)][:: 1 if k % 4 < 2 else -1]
+        pose_a, pose_b = contact_poses(rng, *a, *b)
+        pose_b[:3] += 3 * rng.normal(size=3)
+        cases.append((*a, pose_a + shift, *b, pose_b + shift))
+    return cases

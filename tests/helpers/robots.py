@@ -4,6 +4,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+import warp_abtree as ab
 from warp_abtree.interop.robot.description import Description, Part, RobotFrame
 from warp_abtree.model.mesh import mesh_from_arrays
 
@@ -55,6 +56,11 @@ MJCF = """<mujoco><compiler angle="radian" autolimits="true"/>
 <contact><exclude body1="base" body2="fore"/></contact>
 <equality><joint joint1="follow" joint2="grip" polycoef="-0.04 -1 0 0 0"/></equality>
 </mujoco>"""
+
+
+RING = ab.Model.load(trimesh.creation.torus(0.45, 0.12, 32, 12))
+ROOF = ab.Model.load(trimesh.creation.box((1.5, 0.1, 0.02)))
+AROUND = [(RING, (0, 0, 0.75, 0, 0, 0, 1)), (ROOF, (0, 0.3, 1.1, 0, 0, 0.6, 0.8))]
 
 
 def write_arm(folder, text, name):
@@ -132,3 +138,13 @@ def random_configurations(count, limits=LIMITS, seed=0):
     """Return configurations within limits."""
     low, high = np.array(limits).T
     return np.random.default_rng(seed).uniform(np.maximum(low, -20), np.minimum(high, 20), (count, len(limits)))
+
+
+def asked_pairs(robot):
+    """Return the pairs of names of links that are tested."""
+    names = [robot.link_names[k] for k in robot.model_link]
+    return {frozenset((names[i], names[j])) for i, j in robot.pairs}
+
+
+def pairs_of(*names):
+    return {frozenset(pair.split()) for pair in names}

@@ -30,9 +30,8 @@ def soup(faces, seed, lattice=0):
 
 def crumbs(count, seed=0):
     """Many components: small tetrahedra strewn about."""
-    rng = np.random.default_rng(seed)
     corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-    vertices = (0.3 * corners + rng.uniform(-1, 1, (count, 1, 3))).reshape(-1, 3)
+    vertices = (0.3 * corners + np.random.default_rng(seed).uniform(-1, 1, (count, 1, 3))).reshape(-1, 3)
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
     return vertices, (faces + 4 * np.arange(count)[:, None, None]).reshape(-1, 3)
 
@@ -159,16 +158,9 @@ def raw_state(scene, i):
 
 # A ball, and a ring that moves through it to and fro; tests add what they ask about.
 SHUTTLE_SCENE = """
-[scene]
-frames = 4
-time_step = 0.25
-[models.ball]
-shape = "icosphere"
-subdivisions = 2
-[models.ring]
-shape = "torus"
-major_radius = 1.0
-minor_radius = 0.3
+scene = { frames = 4, time_step = 0.25 }
+models.ball = { shape = "icosphere", subdivisions = 2 }
+models.ring = { shape = "torus", major_radius = 1.0, minor_radius = 0.3 }
 [[objects]]
 model = "ball"
 name = "ball"

@@ -95,3 +95,19 @@ def check_same(result, expected):
     assert got.keys() == wanted.keys()
     for name, value in wanted.items():
         assert np.array_equal(got[name].astype(value.dtype).tobytes(), value.tobytes()), name
+
+
+def scene_with(device, *objects, **options):
+    """Return a scene of models, each alone or in a tuple with a pose, options of its own, or both."""
+    scene = ab.Scene(device)
+    for model, *more in (each if isinstance(each, tuple) else (each,) for each in objects):
+        own = more.pop() if more and isinstance(more[-1], dict) else {}
+        scene.add(model, *more, **{**options, **own})
+    return scene
+
+
+def posed_triangles(scene, i):
+    """Return the corners of an object's original faces in the world."""
+    model, objects = scene.models[scene.object_model[i]], scene.batch().objects.pool
+    vertices, faces, _ = model.mesh_at(model.lod_max)
+    return (vertices @ objects.rotation.numpy()[i].T + objects.position.numpy()[i])[faces]

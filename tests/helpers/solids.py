@@ -3,6 +3,7 @@
 import numpy as np
 
 import warp_abtree as ab
+from helpers.scenes import scene_with
 
 # The two triangles of a unit square's sides, by corners of the cube in binary, outwards.
 SQUARES = {
@@ -60,7 +61,14 @@ def model_of(mesh, name="voxels"):
 
 def ask(device, placed, pairs=((0, 1),), output="any", **options):
     """Return the result for objects given as (model, pose, whether it is a solid)."""
-    scene = ab.Scene(device)
-    for model, pose, solid in placed:
-        scene.add(model, pose, solid=solid)
+    scene = scene_with(device, *[(model, pose, {"solid": solid}) for model, pose, solid in placed])
     return scene.intersect(np.array(pairs), output, **options)
+
+
+def moved(x=0.0, y=0.0, z=0.0):
+    return (x, y, z, 0, 0, 0, 1)
+
+
+def turned(faces, chosen):
+    """Return faces of which those chosen are wound the other way."""
+    return np.where(np.asarray(chosen)[:, None], faces[:, ::-1], faces)

@@ -29,14 +29,10 @@ period = 2
 
 
 BODIES = """
-[scene]
-[dynamics]
-[models.ball]
-shape = "icosphere"
-subdivisions = 1
-[models.floor]
-shape = "box"
-extents = [4, 1, 4]
+scene = {}
+dynamics = {}
+models.ball = { shape = "icosphere", subdivisions = 1 }
+models.floor = { shape = "box", extents = [4, 1, 4] }
 [[objects]]
 model = "floor"
 static = true

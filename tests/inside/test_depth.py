@@ -1,23 +1,25 @@
-"""Depth: the deepest of all samples of one surface inside the other, by brute force, and closed forms."""
+"""Depth and contact points of solids: the deepest samples inside, by brute force, closed forms, and ways out."""
 
 import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from helpers import refused
+from helpers.bodies import about
+from helpers.questions import captured
 from helpers.samples import random_poses
-from helpers.solids import ask, lattice_pose, model_of, shell, voxel_mesh
+from helpers.scenes import scene_with
+from helpers.solids import ask, lattice_pose, model_of, moved, shell, voxel_mesh
 from oracles.inside import parity
+from oracles.motion import posed
 from oracles.triangle import into_frame_of_a
 
 import warp_abtree as ab
 
 BOX = ab.Model.load(trimesh.creation.box((4, 4, 4)))
 BALL = ab.Model.load(trimesh.creation.icosphere(2, 0.5), base_faces=4)
+DEPTH = {"output": "distance", "signed": True}
 KNOT = ab.Model.load(trimesh.creation.torus(1, 0.45, major_sections=14, minor_sections=8), base_faces=4)
-
-
-def moved(x=0.0, y=0.0, z=0.0):
-    return (x, y, z, 0, 0, 0, 1)
 
 
 def samples(triangles):
@@ -28,7 +30,7 @@ def samples(triangles):
 
 
 def brute_depth(inner, outer):
-    """Greatest depth of samples of one surface in the other: 0 where there are none."""
+    """Greatest depth of samples of one surface in the other: 0 where there are none, or all lie on it."""
     points, _ = samples(inner)
     near = ((points >= outer.min((0, 1))) & (points <= outer.max((0, 1)))).all(1)
     points = np.unique(points[near], axis=0)
@@ -36,7 +38,7 @@ def brute_depth(inner, outer):
     for point in points:
         found = trimesh.triangles.closest_point(outer, np.tile(point, (len(outer), 1)))
         depth = np.linalg.norm(found - point, axis=1).min()
-        if depth > deepest + 1e-14 and parity(point, outer):
+        if depth > max(deepest + 1e-14, 1e-12) and parity(point, outer):
             deepest = depth
     return deepest
 
@@ -44,9 +46,9 @@ def brute_depth(inner, outer):
 def check_row(result, row, meshes, poses, solid, tolerance=1e-12):
     """Compare one pair that intersects with brute force, and its witnesses with the meshes; return the depth."""
     a, b = sorted(result.pairs[row].tolist())
-    posed = into_frame_of_a(meshes[b][0], poses[a], poses[b])[meshes[b][1]]
+    other = into_frame_of_a(meshes[b][0], poses[a], poses[b])[meshes[b][1]]
     own = meshes[a][0][meshes[a][1]]
-    expected = max(brute_depth(own, posed) if solid[b] else 0.0, brute_depth(posed, own) if solid[a] else 0.0)
+    expected = max(brute_depth(own, other) if solid[b] else 0.0, brute_depth(other, own) if solid[a] else 0.0)
     depth = -result.distance[row]
     assert abs(depth - expected) <= tolerance
     if depth > 0:
@@ -55,12 +57,8 @@ def check_row(result, row, meshes, poses, solid, tolerance=1e-12):
         gap = result.points[row, 0] - result.points[row, 1]
         assert abs(np.linalg.norm(gap) - depth) < 1e-12
         for k, which in enumerate(result.pairs[row]):
-            matrix = np.eye(4)
-            matrix[:3, :3] = trimesh.transformations.quaternion_matrix(np.roll(poses[which][3:], 1))[:3, :3]
-            matrix[:3, 3] = poses[which][:3]
             vertices, faces, ids = meshes[which]
-            face = vertices[faces[np.flatnonzero(ids == result.point_faces[row, k])[0]]]
-            face = face @ matrix[:3, :3].T + matrix[:3, 3]
+            face = posed(vertices[faces[np.flatnonzero(ids == result.point_faces[row, k])[0]]], poses[which])
             near = trimesh.triangles.closest_point(face[None], result.points[row, k][None])
             assert np.linalg.norm(near - result.points[row, k]) < 1e-12
     return depth
@@ -69,9 +67,7 @@ def check_row(result, row, meshes, poses, solid, tolerance=1e-12):
 @pytest.mark.parametrize("seed", range(3))
 def test_depths_are_those_of_brute_force(device, seed):
     rng = np.random.default_rng(seed)
-    scene = ab.Scene(device)
-    for i in range(8):
-        scene.add((KNOT, BALL)[i % 2], moved(), solid=i % 4 != 3)
+    scene = scene_with(device, *[((KNOT, BALL)[i % 2], moved(), {"solid": i % 4 != 3}) for i in range(8)])
     pairs = np.array([(i, j) for i in range(8) for j in range(i)])
     pairs[::2] = pairs[::2, ::-1]
     deep = 0
@@ -93,47 +89,41 @@ def test_closed_forms(device):
     """A ball sinks into a floor past whole rings of faces; a peg too thick for its hole; bodies of equal size."""
     for solid in (False, True):
         for sink in (1e-6, 0.1, 0.5, 0.9, 1.4):
-            found = ask(
-                device, [(BOX, moved(), True), (BALL, moved(z=2.5 - sink), solid)], output="distance", signed=True
-            )
+            found = ask(device, [(BOX, moved(), True), (BALL, moved(z=2.5 - sink), solid)], **DEPTH)
             assert found.distance[0] == pytest.approx(-sink, rel=1e-9)
             way = found.points[0, 0] - found.points[0, 1]
             np.testing.assert_allclose(way / np.linalg.norm(way), [0, 0, 1], atol=1e-6)
     peg = trimesh.creation.cylinder(1.01, 4, sections=64)
     plate = trimesh.creation.annulus(0.99, 2, 1, sections=64)
     peg, plate = ab.Model.load(peg), ab.Model.load(plate)
-    found = ask(device, [(peg, moved(), True), (plate, moved(), True)], output="distance", signed=True)
+    found = ask(device, [(peg, moved(), True), (plate, moved(), True)], **DEPTH)
     assert -0.021 < found.distance[0] < -0.019
     # Laid on one another, side on side, with all corners on the other's sides.
     for z, expected in ((3.9, -0.1), (4.0, 0.0), (4.5, 0.5)):
-        found = ask(device, [(BOX, moved(), True), (BOX, moved(z=z), True)], output="distance", signed=True)
+        found = ask(device, [(BOX, moved(), True), (BOX, moved(z=z), True)], **DEPTH)
         assert found.distance[0] == pytest.approx(expected, abs=1e-12)
     # Coincident: every sample lies on the other surface.
-    assert ask(device, [(BOX, moved(), True), (BOX, moved(), True)], output="distance", signed=True).distance[0] == 0
+    assert ask(device, [(BOX, moved(), True), (BOX, moved(), True)], **DEPTH).distance[0] == 0
 
 
 def test_a_single_face(device):
     sheet = ab.Model.from_arrays([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    for placed in (
-        [(BOX, moved(), True), (sheet, moved(1.5), False)],
-        [(sheet, moved(1.5), False), (BOX, moved(), True)],
-    ):
-        assert ask(device, placed, output="distance", signed=True).distance[0] == pytest.approx(-0.5, abs=1e-12)
+    both = [(BOX, moved(), True), (sheet, moved(1.5), False)]
+    for placed in (both, both[::-1]):
+        assert ask(device, placed, **DEPTH).distance[0] == pytest.approx(-0.5, abs=1e-12)
 
 
 def test_in_a_cavity_distances_stay_positive(device):
     hollow = model_of(voxel_mesh(shell(5)), "hollow")
-    found = ask(device, [(hollow, moved(), True), (BALL, moved(2.5, 2.5, 2.5), True)], output="distance", signed=True)
+    found = ask(device, [(hollow, moved(), True), (BALL, moved(2.5, 2.5, 2.5), True)], **DEPTH)
     assert 0.99 < found.distance[0] < 1.01
-    found = ask(device, [(hollow, moved(), True), (BALL, moved(2.5, 2.5, 1.0), True)], output="distance", signed=True)
+    found = ask(device, [(hollow, moved(), True), (BALL, moved(2.5, 2.5, 1.0), True)], **DEPTH)
     assert found.distance[0] < -0.4
 
 
 def test_the_same_bits_in_any_order_and_batch(device):
     rng = np.random.default_rng(7)
-    scene = ab.Scene(device)
-    for i, pose in enumerate(random_poses(rng, 10, 0.8)):
-        scene.add((KNOT, BALL)[i % 2], pose, solid=True)
+    scene = scene_with(device, *zip((KNOT, BALL) * 5, random_poses(rng, 10, 0.8)), solid=True)
     pairs = np.array([(i, j) for i in range(10) for j in range(i)])
     first = scene.intersect(pairs, "distance", signed=True)
     order = rng.permutation(len(pairs))
@@ -155,26 +145,14 @@ def test_lattice_bodies(device):
         bodies = [voxel_mesh(rng.integers(0, 3, (8, 3)), rng) for _ in range(2)]
         poses = lattice_pose(rng, 1), lattice_pose(rng, 1)
         models = [model_of((vertices * (1, 0.5)[k], faces)) for k, (vertices, faces) in enumerate(bodies)]
-        found = ask(device, list(zip(models, poses, (True, True))), output="distance", signed=True)
+        found = ask(device, list(zip(models, poses, (True, True))), **DEPTH)
         if found.any[0]:
             meshes = [model.mesh_at(model.lod_max)[:2] for model in models]
             own, other = meshes[0][0][meshes[0][1]], into_frame_of_a(meshes[1][0], *poses)[meshes[1][1]]
-            expected = max(brute_lattice(own, other), brute_lattice(other, own))
+            expected = max(brute_depth(own, other), brute_depth(other, own))
             assert -found.distance[0] == pytest.approx(expected, abs=1e-12)
             deep += expected > 0
     assert deep > 2
-
-
-def brute_lattice(inner, outer):
-    """As `brute_depth`, samples on the surface being none."""
-    deepest = 0.0
-    for point in np.unique(samples(inner)[0], axis=0):
-        depth = np.linalg.norm(
-            trimesh.triangles.closest_point(outer, np.tile(point, (len(outer), 1))) - point, axis=1
-        ).min()
-        if depth > 1e-12 and parity(point, outer):
-            deepest = max(deepest, depth)
-    return deepest
 
 
 def test_sweeps_and_captured_queries(device):
@@ -184,21 +162,16 @@ def test_sweeps_and_captured_queries(device):
     assert found["distance"][0] < -1.5
     plain = ab.sweep(BOX, BALL, poses, output="distance", device=device, solid=True)
     np.testing.assert_array_equal(plain["distance"], np.maximum(found["distance"], 0))
-    with pytest.raises(ValueError, match="signed 1 is neither"):
-        ab.sweep(BOX, BALL, poses, output="distance", device=device, signed=1)
-    with pytest.raises(ValueError, match="signed means nothing"):
-        ab.sweep(BOX, BALL, poses, output="any", device=device, signed=True)
+    refused(ValueError, "signed 1 is neither", ab.sweep, BOX, BALL, poses, output="distance", device=device, signed=1)
+    refused(ValueError, "signed means nothing", ab.sweep, BOX, BALL, poses, output="any", device=device, signed=True)
     if device != "cpu" and not wp.is_mempool_enabled(device):
         return
-    scene = ab.Scene(device)
-    scene.add(BOX, solid=True)
-    scene.add(BALL, poses[0], solid=True)
+    scene = scene_with(device, BOX, (BALL, poses[0]), solid=True)
     query = ab.DistanceQuery(scene, np.array([(0, 1)]), signed=True)
-    with wp.ScopedCapture(device) as capture:
-        query.launch()
+    replay = captured(query)
     for k, pose in enumerate(poses):
         scene.set_poses(np.array([moved(), pose]))
-        wp.capture_launch(capture.graph)
+        replay()
         assert query.result().distance[0] == found["distance"][k]
 
 
@@ -216,9 +189,7 @@ def test_depths_of_surfaces_are_refused(device, pairs):
     """Three surfaces, beside which a solid stands or does not."""
     given = None if pairs is None else np.array(pairs, np.int32).reshape(-1, 2)
     for with_solid in (False, True):
-        scene = ab.Scene(device)
-        for x in (0.0, 1.0, 1.5):
-            scene.add(BALL, moved(x))
+        scene = scene_with(device, *[(BALL, moved(x)) for x in (0.0, 1.0, 1.5)])
         scene.add(BOX, moved(50.0), solid=with_solid)
         # Of no pair at all nothing is wrong; nor of what the broad phase happens to find in a scene with a solid.
         fine = with_solid and not pairs
@@ -226,24 +197,21 @@ def test_depths_of_surfaces_are_refused(device, pairs):
             if fine:
                 ask_it()
                 continue
-            with pytest.raises(ValueError, match=r"^signed: no object of the pairs is a solid"):
-                ask_it()
+            refused(ValueError, r"^signed: no object of the pairs is a solid", ask_it)
         found = scene.intersect(given, "distance")
         if fine:
             np.testing.assert_array_equal(scene.intersect(given, "distance", signed=True).distance, found.distance)
     mixed = scene.intersect([(0, 1), (0, 3)], "distance", signed=True)
     np.testing.assert_array_equal(mixed.distance, scene.intersect([(0, 1), (0, 3)], "distance").distance)
-    with pytest.raises(ValueError, match="signed means nothing"):
-        scene.intersect(np.array([(0, 1)]), "any", signed=True)
+    refused(ValueError, "signed means nothing", scene.intersect, np.array([(0, 1)]), "any", signed=True)
 
 
 @pytest.mark.parametrize("count", [0, 3])
 def test_depths_of_surfaces_in_sweeps_are_refused(device, count):
     poses = np.array([moved(0.5)] * 3)[:count]
-    with pytest.raises(ValueError, match=r"^signed: no object of the pairs is a solid"):
-        ab.sweep(BALL, BOX, poses, output="distance", device=device, signed=True)
+    refused(ValueError, r"^signed: no object of the pairs", ab.sweep, BALL, BOX, poses, device=device, **DEPTH)
     for solid in ((True, False), (False, True)):
-        assert len(ab.sweep(BALL, BOX, poses, output="distance", device=device, signed=True, solid=solid)) == count
+        assert len(ab.sweep(BALL, BOX, poses, device=device, solid=solid, **DEPTH)) == count
 
 
 def test_depths_after_the_broad_phase_found_surfaces_alone(device):
@@ -258,3 +226,113 @@ def test_depths_after_the_broad_phase_found_surfaces_alone(device):
     scene.set_poses(poses)
     expected = ab.DistanceQuery(scene, [(0, 1)], signed=True).run().distance
     assert scene.intersect([(0, 1)], "distance", signed=True).distance == expected < 0
+
+
+SLAB = ab.Model.load(trimesh.creation.box((4, 4, 2)))
+RING = ab.Model.load(trimesh.creation.torus(0.6, 0.25, 18, 10), base_faces=4)
+SMALL = ab.Model.load(trimesh.creation.icosphere(1, 0.2), base_faces=4)
+
+
+def points_of(device, placed, solid=True, **options):
+    """Return the contact points of (model, pose) in a scene, and the result."""
+    result = ab.ManifoldQuery(scene_with(device, *placed, solid=solid), pairs=[(0, 1)], **options).run()
+    return result.points, result
+
+
+def triangles_of(model, pose):
+    """Return the corners of the faces in the world, (n, 3, 3)."""
+    vertices, faces, _ = model.mesh_at(model.lod_max)
+    return posed(vertices, np.asarray(pose))[faces]
+
+
+def depth_in(point, triangles):
+    """Return the distance of a point from a surface, and the nearest point."""
+    near = trimesh.triangles.closest_point(triangles, np.tile(point, (len(triangles), 1)))
+    away = np.linalg.norm(near - point, axis=1)
+    return away.min(), near[away.argmin()]
+
+
+def greatest_depth(inner, outer):
+    """Greatest depth of corners of one surface inside the other, by brute force."""
+    corners = np.unique(inner.reshape(-1, 3), axis=0)
+    corners = corners[((corners > outer.min((0, 1))) & (corners < outer.max((0, 1)))).all(1)]
+    depths = np.array([depth_in(x, outer)[0] for x in corners])
+    return next((depths[k] for k in np.argsort(-depths) if parity(corners[k], outer)), 0.0)
+
+
+@pytest.mark.parametrize("models", [(BALL, RING), (RING, RING)])
+def test_a_pair_is_as_deep_as_its_deepest_corner(device, models):
+    """Of corners whose way out is on the side of the others'; and never deeper than any way out."""
+    rng = np.random.default_rng(2)
+    added = 0
+    for _ in range(4):
+        poses = random_poses(rng, 2, 0.35)
+        points, result = points_of(device, list(zip(models, poses)))
+        plain, _ = points_of(device, list(zip(models, poses)), solid=False)
+        if not result.any[0]:
+            continue
+        assert len(points["pair"]) <= 8
+        sides = [triangles_of(*placed) for placed in zip(models, poses)]
+        deepest = max(greatest_depth(*sides), greatest_depth(*sides[::-1]))
+        known = {tuple(x) for x in plain["point"].tolist()}
+        for x, normal, depth in zip(*(points[name] for name in ("point", "normal", "depth"))):
+            if tuple(x.tolist()) in known:
+                continue
+            added += 1
+            # Of a corner of the first object in the second the way out is against the normal.
+            inside = [np.abs(side.reshape(-1, 3) - x).max(1).min() < 1e-12 for side in sides]
+            assert sum(inside) == 1, "it is a corner of one of both"
+            outer = sides[1] if inside[0] else sides[0]
+            expected, foot = depth_in(x, outer)
+            assert depth == pytest.approx(expected, abs=1e-12) and depth <= deepest + 1e-12
+            assert parity(x, outer)
+            np.testing.assert_allclose(normal, (x - foot if inside[0] else foot - x) / expected, atol=1e-9)
+    assert added > 1
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_ring_that_has_gone_under_is_as_deep_as_it_is(device, order):
+    """Whole rings of faces are under the surface; without solids depth is that of the faces that cross."""
+    for sink in (0.15, 0.2, 0.3):
+        placed = [(SLAB, (0, 0, -1, 0, 0, 0, 1)), (RING, (0.1, 0.2, 0.25 - sink, *about((0, 0, 1), 0.1)))]
+        low = -triangles_of(*placed[1])[..., 2].min()
+        points, _ = points_of(device, [placed[k] for k in order])
+        plain, _ = points_of(device, [placed[k] for k in order], solid=False)
+        assert points["depth"].max() == pytest.approx(low, abs=1e-12)
+        assert plain["depth"].max() < 0.8 * low
+        up = 1 if order == (0, 1) else -1
+        deep = points["depth"] > 0.9 * low
+        assert deep.sum() == 4, "far from one another"
+        np.testing.assert_allclose(points["normal"][deep], [[0, 0, up]] * 4, atol=1e-9)
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_what_lies_inside_whole_has_points_that_push_it_out_one_way(device, order):
+    placed = [(SLAB, (0, 0, -1, 0, 0, 0, 1)), (SMALL, (0.3, 0.2, -0.8, *about((1, 2, 3), 0.3)))]
+    points, result = points_of(device, [placed[k] for k in order])
+    assert result.any[0] and result.count[0] == 0
+    assert 1 <= len(points["pair"]) <= 4
+    up = 1 if order == (0, 1) else -1
+    np.testing.assert_allclose(points["normal"], [[0, 0, up]] * len(points["pair"]), atol=1e-9)
+    np.testing.assert_allclose(points["depth"], -points["point"][:, 2], atol=1e-12)
+    assert points["depth"].max() == pytest.approx(-triangles_of(*placed[1])[..., 2].min(), abs=1e-12)
+    assert not points_of(device, placed, solid=False)[0]["pair"].size
+
+
+def test_solids_whose_contacts_know_their_depth_keep_their_points(device):
+    """To the bit: boxes on one another, and what only touches."""
+    for z in (0.5, 0.499, 0.45):
+        placed = [(SLAB, (0, 0, -1, 0, 0, 0, 1)), (ab.Model.load(trimesh.creation.box()), (0, 0, z, 0, 0, 0, 1))]
+        with_solids, without = (points_of(device, placed, solid=solid)[0] for solid in (True, False))
+        for name, values in without.items():
+            assert np.array_equal(values, with_solids[name]), name
+
+
+def test_bodies_that_are_deep_in_a_solid_come_out(device):
+    for model, z in ((SMALL, -0.8), (RING, 0.0)):
+        ground = (SLAB, (0, 0, -1, 0, 0, 0, 1), {"static": True, "solid": True})
+        bodies = ab.Dynamics(scene_with(device, ground, (model, (0, 0, z, 0, 0, 0, 1))))
+        for _ in range(60):
+            bodies.step(1 / 60)
+        low = triangles_of(model, bodies.poses()[1])[..., 2].min()
+        assert abs(low) < 0.005 and abs(bodies.velocities()[0][1, 2]) < 0.1

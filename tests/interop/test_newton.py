@@ -1,9 +1,13 @@
-"""Contacts for Newton, where it is installed: geometry against closed forms, and bodies that its solver holds up."""
+"""Contacts for Newton: geometry against closed forms, bodies at rest, mirrored shapes, and settings that change."""
+
+import itertools
 
 import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from helpers import refused
+from helpers.bodies import at, collided, contact_rows, newton_mesh, settle, touching_shapes
 
 import warp_abtree as ab
 from warp_abtree.interop import newton as adapter
@@ -12,17 +16,9 @@ newton = pytest.importorskip("newton")
 # Newton's first steps compile its own kernels, which takes most of the time of this file.
 
 
-def mesh_of(shape):
-    return newton.Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces).ravel())
-
-
-def placed(position, axis=(0, 0, 1), angle=0.0):
-    axis = np.asarray(axis, float) / np.linalg.norm(axis)
-    return wp.transform(wp.vec3(*position), wp.quat(*(np.sin(angle / 2) * axis), float(np.cos(angle / 2))))
-
-
 CUBE = trimesh.creation.box((1, 1, 1))
 FLOOR = trimesh.creation.box((8, 8, 1))
+Config = newton.ModelBuilder.ShapeConfig
 
 
 def matrix(pose):
@@ -34,30 +30,25 @@ def matrix(pose):
 
 def world_points(model, state, contacts):
     """Surface points of both shapes in the world, by Newton's convention for points and offsets of bodies."""
-    count = int(contacts.rigid_contact_count.numpy()[0])
     body, body_q = model.shape_body.numpy(), state.body_q.numpy()
     points = []
     for side in (0, 1):
-        names = [f"rigid_contact_{name}{side}" for name in ("shape", "point", "offset")]
-        shapes, point, offset = (getattr(contacts, name).numpy()[:count] for name in names)
+        shapes, point, offset = contact_rows(contacts, *(f"{name}{side}" for name in ("shape", "point", "offset")))
         poses = [np.eye(4) if body[s] < 0 else matrix(body_q[body[s]]) for s in shapes]
         points.append(np.array([(m @ [*x, 1])[:3] for m, x in zip(poses, point + offset)]).reshape(-1, 3))
-    return points, contacts.rigid_contact_normal.numpy()[:count]
+    return points, *contact_rows(contacts, "normal")
 
 
 def test_a_cube_on_a_floor_has_its_corners(device):
     builder = newton.ModelBuilder()
-    turn = (0, 0, 1), 0.5
-    config = newton.ModelBuilder.ShapeConfig(margin=0.02)
-    builder.add_shape_mesh(-1, xform=placed((0, 0, -0.5)), mesh=mesh_of(FLOOR), cfg=config)
-    body = builder.add_body(xform=placed((0.3, 0.2, 0.0), *turn))
+    config = Config(margin=0.02)
+    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=newton_mesh(FLOOR), cfg=config)
+    body = builder.add_body(xform=at(0.3, 0.2, angle=0.5))
     # The shape stands off its body, and its mesh is scaled.
-    builder.add_shape_mesh(body, xform=placed((0, 0, 0.49)), mesh=mesh_of(CUBE), scale=wp.vec3(1.0, 0.8, 1.0))
+    builder.add_shape_mesh(body, xform=at(z=0.49), mesh=newton_mesh(CUBE), scale=wp.vec3(1.0, 0.8, 1.0))
     model = builder.finalize(device=device)
-    state, found = model.state(), ab.NewtonContacts(model)
-    contacts = found.contacts()
-    for _ in range(2):
-        found.collide(state, contacts)
+    state, found, contacts = collided(model)
+    found.collide(state, contacts)
     (first, second), normals = world_points(model, state, contacts)
     assert len(normals) == 4
     np.testing.assert_allclose(normals, np.tile([0, 0, 1], (4, 1)), atol=1e-6)
@@ -65,7 +56,7 @@ def test_a_cube_on_a_floor_has_its_corners(device):
         assert set(getattr(contacts, f"rigid_contact_shape{side}").numpy()[:4]) == {side}
     # The floor's margin thickens it, as in Newton.
     np.testing.assert_allclose((second - first) @ [0, 0, 1], -0.03, atol=1e-6)
-    r = matrix([0, 0, 0, *placed((0, 0, 0), *turn)[3:]])[:3, :3]
+    r = matrix([0, 0, 0, *at(angle=0.5)[3:]])[:3, :3]
     corners = np.array([r @ [x, y, 0] + [0.3, 0.2, 0] for x in (-0.5, 0.5) for y in (-0.4, 0.4)])
     for corner in corners:
         assert np.abs(0.5 * (first + second) - corner)[:, :2].max(1).min() < 1e-6
@@ -77,17 +68,15 @@ def test_a_cube_on_a_floor_has_its_corners(device):
 def test_what_is_inside_a_solid_is_pushed_out(device, captured):
     """A cube wholly inside a floor crosses no face of it; as a solid the floor knows how deep it is."""
     builder = newton.ModelBuilder()
-    builder.add_shape_mesh(-1, mesh=mesh_of(FLOOR))
-    body = builder.add_body(xform=placed((0.3, 0.2, 0.3), (0, 0, 1), 0.4))
-    builder.add_shape_mesh(body, mesh=mesh_of(CUBE), scale=wp.vec3(0.2, 0.2, 0.2))
+    builder.add_shape_mesh(-1, mesh=newton_mesh(FLOOR))
+    body = builder.add_body(xform=at(0.3, 0.2, 0.3, angle=0.4))
+    builder.add_shape_mesh(body, mesh=newton_mesh(CUBE), scale=wp.vec3(0.2, 0.2, 0.2))
     builder.add_shape_sphere(body, radius=0.01)
     model = builder.finalize(device=device)
     model.shape_gap.fill_(0.0)
-    state, depths = model.state(), {}
+    depths = {}
     for solids in (False, [0], True):
-        found = ab.NewtonContacts(model, solids=solids)
-        contacts = found.contacts()
-        found.collide(state, contacts)
+        state, found, contacts = collided(model, solids=solids)
         if captured:
             with wp.ScopedCapture(wp.get_device(device)) as capture:
                 found.launch(state, contacts)
@@ -99,29 +88,27 @@ def test_what_is_inside_a_solid_is_pushed_out(device, captured):
         assert all(normal @ [0, 0, 1] > 1 - 1e-6 for normal in normals)
     assert depths["False"] == [] and depths["[0]"] == depths["True"]
     np.testing.assert_allclose(depths["True"][-1], 0.3, atol=1e-6)
-    with pytest.raises(ValueError, match="shape 2 is no mesh"):
-        ab.NewtonContacts(model, solids=[0, 2])
+    refused(ValueError, "shape 2 is no mesh", ab.NewtonContacts, model, solids=[0, 2])
 
 
 def test_a_solid_is_closed(device):
     builder = newton.ModelBuilder()
     open_cube = trimesh.Trimesh(CUBE.vertices, CUBE.faces[:-1], process=False)
     for mesh in (CUBE, open_cube):
-        builder.add_shape_mesh(builder.add_body(), mesh=mesh_of(mesh))
+        builder.add_shape_mesh(builder.add_body(), mesh=newton_mesh(mesh))
     model = builder.finalize(device=device)
     ab.NewtonContacts(model, solids=[0])
-    with pytest.raises(ab.MeshError, match="not closed"):
-        ab.NewtonContacts(model, solids=True)
+    refused(ab.MeshError, "not closed", ab.NewtonContacts, model, solids=True)
 
 
 def test_filters_groups_and_worlds(device):
     def add(builder, **config):
-        body = builder.add_body(xform=placed((0, 0, 0)))
-        return builder.add_shape_mesh(body, mesh=mesh_of(CUBE), cfg=newton.ModelBuilder.ShapeConfig(**config))
+        body = builder.add_body(xform=at())
+        return builder.add_shape_mesh(body, mesh=newton_mesh(CUBE), cfg=Config(**config))
 
     part = newton.ModelBuilder()
     add(part)
-    part.add_shape_mesh(0, xform=placed((0.5, 0, 0)), mesh=mesh_of(CUBE))  # of the same body
+    part.add_shape_mesh(0, xform=at(0.5), mesh=newton_mesh(CUBE))  # of the same body
     builder = newton.ModelBuilder()
     for _ in range(2):
         builder.add_world(part)
@@ -140,58 +127,28 @@ def test_filters_groups_and_worlds(device):
 
 def test_room_and_wrong_models(device):
     builder = newton.ModelBuilder()
-    builder.add_shape_mesh(-1, xform=placed((0, 0, -0.5)), mesh=mesh_of(FLOOR))
+    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=newton_mesh(FLOOR))
     builder.add_shape_sphere(builder.add_body())
-    with pytest.raises(ValueError, match="1 shapes that are meshes"):
-        ab.NewtonContacts(builder.finalize(device=device))
-    builder.add_shape_mesh(builder.add_body(xform=placed((0, 0, 0.49))), mesh=mesh_of(CUBE))
+    refused(ValueError, "1 shapes that are meshes", ab.NewtonContacts, builder.finalize(device=device))
+    builder.add_shape_mesh(builder.add_body(xform=at(z=0.49)), mesh=newton_mesh(CUBE))
     model = builder.finalize(device=device)
     found = ab.NewtonContacts(model)
-    with pytest.raises(ab.CapacityError, match=r"\d rigid contacts"):
-        found.collide(model.state(), found.contacts(2))
+    refused(ab.CapacityError, r"\d rigid contacts", found.collide, model.state(), found.contacts(2))
 
 
 @pytest.mark.parametrize("gap, margin, count", [(0.03, 0.0, 4), (0.02, 0.0, 0), (0.02, 0.01, 4)])
 def test_gaps_and_margins_are_those_of_newton(device, gap, margin, count):
     """A cube 0.05 above a floor: contacts where margins and gaps of both reach that far, with what margins leave."""
-    config = newton.ModelBuilder.ShapeConfig(gap=gap, margin=margin)
+    config = Config(gap=gap, margin=margin)
     builder = newton.ModelBuilder()
-    builder.add_shape_mesh(-1, xform=placed((0, 0, -0.5)), mesh=mesh_of(FLOOR), cfg=config)
-    builder.add_shape_mesh(builder.add_body(xform=placed((0, 0, 0.55))), mesh=mesh_of(CUBE), cfg=config)
+    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=newton_mesh(FLOOR), cfg=config)
+    builder.add_shape_mesh(builder.add_body(xform=at(z=0.55)), mesh=newton_mesh(CUBE), cfg=config)
     model = builder.finalize(device=device)
-    state, found = model.state(), ab.NewtonContacts(model)
-    contacts = found.contacts()
-    found.collide(state, contacts)
+    state, _, contacts = collided(model)
     (first, second), normals = world_points(model, state, contacts)
     assert len(normals) == count
     np.testing.assert_allclose((second - first) @ [0, 0, 1], 0.05 - 2 * margin, atol=1e-6)
     np.testing.assert_allclose(normals, np.tile([0, 0, 1], (count, 1)), atol=1e-6)
-
-
-def test_shapes_that_are_no_meshes_are_newtons(device):
-    """Two mesh cubes, one on the other, and a sphere stand on Newton's ground plane."""
-    config = newton.ModelBuilder.ShapeConfig(gap=0.01)
-    builder = newton.ModelBuilder()
-    builder.add_ground_plane()
-    for z in (0.5, 1.5):
-        builder.add_shape_mesh(builder.add_body(xform=placed((0, 0, z))), mesh=mesh_of(CUBE), cfg=config)
-    builder.add_shape_sphere(builder.add_body(xform=placed((3, 0, 0.3))), radius=0.3, cfg=config)
-    model = builder.finalize(device=device)
-    found = ab.NewtonContacts(model)
-    solver, contacts, control = newton.solvers.SolverXPBD(model), found.contacts(), model.control()
-    state, after = model.state(), model.state()
-    for _ in range(60):
-        state.clear_forces()
-        found.collide(state, contacts)
-        solver.step(state, after, control, contacts, 1 / 240)
-        state, after = after, state
-    count = int(contacts.rigid_contact_count.numpy()[0])
-    pairs = {
-        tuple(pair)
-        for pair in np.stack([getattr(contacts, f"rigid_contact_shape{k}").numpy() for k in (0, 1)], 1)[:count]
-    }
-    assert {tuple(sorted(pair)) for pair in pairs} == {(0, 1), (1, 2), (0, 3)}
-    np.testing.assert_allclose(state.body_q.numpy()[:, 2], [0.5, 1.5, 0.3], atol=0.01)
 
 
 def test_excluded_pairs_of_many_shapes():
@@ -211,21 +168,189 @@ def test_excluded_pairs_of_many_shapes():
     assert adapter.group_pairs(np.ones(10_000, int), world) == []
 
 
+def test_shapes_that_are_no_meshes_are_newtons(device):
+    """Two mesh cubes, one on the other, and a sphere stand on Newton's ground plane."""
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    for z in (0.5, 1.5):
+        builder.add_shape_mesh(builder.add_body(xform=at(z=z)), mesh=newton_mesh(CUBE), cfg=Config(gap=0.01))
+    builder.add_shape_sphere(builder.add_body(xform=at(3, 0, 0.3)), radius=0.3, cfg=Config(gap=0.01))
+    model = builder.finalize(device=device)
+    poses, contacts = settle(model, ab.NewtonContacts(model), 60)
+    assert touching_shapes(contacts) == {(0, 1), (1, 2), (0, 3)}
+    np.testing.assert_allclose(poses[:, 2], [0.5, 1.5, 0.3], atol=0.01)
+
+
 def test_a_ring_falls_over_a_peg_in_newton(device):
     builder = newton.ModelBuilder()
-    builder.add_shape_mesh(-1, xform=placed((0, 0, -0.5)), mesh=mesh_of(FLOOR))
-    peg = trimesh.creation.cylinder(0.3, 1.2, sections=8)
-    builder.add_shape_mesh(-1, xform=placed((0, 0, 0.55)), mesh=mesh_of(peg))
-    ring = builder.add_body(xform=placed((0.1, 0, 1.0), (2, 1, 0), 0.15))
-    builder.add_shape_mesh(ring, mesh=mesh_of(trimesh.creation.torus(0.8, 0.25, 16, 8)))
+    peg, ring = trimesh.creation.cylinder(0.3, 1.2, sections=8), trimesh.creation.torus(0.8, 0.25, 16, 8)
+    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=newton_mesh(FLOOR))
+    builder.add_shape_mesh(-1, xform=at(z=0.55), mesh=newton_mesh(peg))
+    builder.add_shape_mesh(builder.add_body(xform=at(0.1, 0, 1.0, (2, 1, 0), 0.15)), mesh=newton_mesh(ring))
     model = builder.finalize(device=device)
-    found = ab.NewtonContacts(model)
-    solver, contacts, control = newton.solvers.SolverXPBD(model), found.contacts(), model.control()
-    state, after = model.state(), model.state()
-    for _ in range(400):
-        state.clear_forces()
-        found.collide(state, contacts)
-        solver.step(state, after, control, contacts, 1 / 240)
-        state, after = after, state
-    x, y, z = state.body_q.numpy()[0, :3]
+    x, y, z = settle(model, ab.NewtonContacts(model), 400)[0][0, :3]
     assert np.hypot(x, y) < 0.3 and z == pytest.approx(0.25, abs=0.02)
+
+
+GROUND = trimesh.creation.box((4, 4, 1))
+# A wedge with a step, like none of its mirror images.
+PART = trimesh.Trimesh(
+    [[0, 0, 0], [1, 0, 0], [0, 0.6, 0], [0, 0, 0.3], [0.7, 0, 0.5], [0.1, 0.5, 0.2]],
+    [[0, 2, 1], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]],
+    process=False,
+)
+CLOSE = newton.ModelBuilder.ShapeConfig(gap=0.02, margin=0.0)
+
+
+def found_points(model, **options):
+    """Return shapes, normals and points of the contacts of a model at its poses."""
+    return contact_rows(collided(model, **options)[2], "shape0", "shape1", "normal", "point0", "point1")
+
+
+def mirrored_model(device, scale, mirrored_by_hand, on_body, solids):
+    builder = newton.ModelBuilder()
+    faces, low = PART.faces, float((PART.vertices * scale)[:, 2].min())
+    mesh, place = newton_mesh(PART), at(0.2, 0.1, (-0.4 if solids else -0.01) - low)
+    given = wp.vec3(*map(float, scale))
+    if mirrored_by_hand:
+        faces, given = faces[:, ::-1] if np.prod(scale) < 0 else faces, wp.vec3(1.0, 1.0, 1.0)
+        mesh = newton_mesh(trimesh.Trimesh(PART.vertices * scale, faces, process=False))
+    # Two that are static never meet: either moves.
+    floor = -1 if on_body else builder.add_body(xform=at(z=-0.5))
+    builder.add_shape_mesh(floor, xform=at(z=-0.5) if on_body else at(), mesh=newton_mesh(GROUND), cfg=CLOSE)
+    body = builder.add_body(xform=place) if on_body else -1
+    builder.add_shape_mesh(body, xform=at() if on_body else place, mesh=mesh, scale=given, cfg=CLOSE)
+    if on_body:
+        # The same mesh, not mirrored, far from the others: it shares no model with the mirrored one.
+        builder.add_shape_mesh(builder.add_body(xform=at(x=9)), mesh=mesh, cfg=CLOSE)
+    return builder.finalize(device=device)
+
+
+@pytest.mark.parametrize("solids", [False, True])
+@pytest.mark.parametrize("on_body", [False, True])
+def test_mirrored_shapes_are_those_mirrored_by_hand(device, on_body, solids):
+    for scale in itertools.product((1.0, -2.0), (1.0, -0.5), (1.0, -1.0)):
+        found, expected = (
+            found_points(mirrored_model(device, np.array(scale), by_hand, on_body, solids), solids=solids)
+            for by_hand in (False, True)
+        )
+        assert len(found[0]) > 0
+        for a, b in zip(found, expected):
+            np.testing.assert_allclose(a, b, atol=1e-6)
+        # From the floor to what stands on it, also where that is in the floor.
+        up = found[2][:, 2] * np.where(found[0] == 0, 1, -1)
+        assert (up > 0.5).all(), scale
+
+
+def test_mirrored_shapes_rest_where_newton_has_them(device):
+    """A mirrored ball on a mirrored floor, beside Newton's own contacts."""
+    ball = trimesh.creation.icosphere(1, radius=0.3)
+    low = float(ball.vertices[:, 2].min())
+    builder = newton.ModelBuilder()
+    floor = newton_mesh(GROUND)
+    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=floor, scale=wp.vec3(1.0, -1.0, 1.0), cfg=CLOSE)
+    body = builder.add_body(xform=at(z=-low))
+    builder.add_shape_mesh(body, mesh=newton_mesh(ball), scale=wp.vec3(-1.0, -1.0, -1.0), cfg=CLOSE)
+    model = builder.finalize(device=device)
+    finders = ab.NewtonContacts(model), newton.CollisionPipeline(model)
+    ours, newtons = (settle(model, found, 40, iterations=10)[0] for found in finders)
+    assert ours[0, 2] == pytest.approx(newtons[0, 2], abs=0.003) == pytest.approx(-low, abs=0.003)
+
+
+def stack(device):
+    """Return a model of a mesh floor, two mesh bodies on it, and a sphere."""
+    builder = newton.ModelBuilder()
+    floor, part = newton_mesh(GROUND), newton_mesh(PART)
+    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=floor, cfg=CLOSE)
+    for x in (-1.0, 1.0):
+        builder.add_shape_mesh(builder.add_body(xform=at(x=x, z=-0.01)), mesh=part, cfg=CLOSE)
+    builder.add_shape_sphere(builder.add_body(xform=at(z=0.29)), radius=0.3, cfg=CLOSE)
+    builder.add_shape_collision_filter_pair(0, 3)
+    return builder.finalize(device=device)
+
+
+def change(model, name, shape, value):
+    """Change one entry of an array in place."""
+    values = getattr(model, name).numpy()
+    values[shape] = value
+    getattr(model, name).assign(values)
+
+
+CHANGES = {
+    "shape_type": (3, int(newton.GeoType.BOX)),
+    "shape_scale": (1, (1.0, 1.0, -1.0)),
+    "shape_margin": (2, 0.01),
+    "shape_gap": (0, 0.5),
+    "shape_collision_group": (3, 7),
+    "shape_world": (1, 0),
+    "shape_body": (1, 1),
+    "shape_flags": (2, 0),
+}
+
+
+@pytest.mark.parametrize("captured", [False, True])
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_is_read_once_is_refused_where_it_changed(device, name, captured):
+    model = stack(device)
+    state, found, contacts = collided(model)
+    if captured:
+        if device != "cpu" and not wp.is_mempool_enabled(device):
+            pytest.skip("no graph without a memory pool")
+        with wp.ScopedCapture(wp.get_device(device)) as capture:
+            found.launch(state, contacts)
+
+    def ask():
+        if captured:
+            wp.capture_launch(capture.graph)
+            wp.capture_launch(capture.graph)
+            found.check(contacts)
+        else:
+            found.collide(state, contacts)
+
+    shape, value = CHANGES[name]
+    values = getattr(model, name)
+    kept = np.array(values.numpy()[shape])
+    message = rf"^{name} of shape {shape} changed since NewtonContacts read it, once; make a new one$"
+    # The array itself, then another in its place.
+    for other in (values, wp.clone(values)):
+        setattr(model, name, other)
+        ask()
+        change(model, name, shape, value)
+        refused(RuntimeError, message, ask)
+        change(model, name, shape, kept)
+        ask()
+
+
+def test_other_meshes_and_filters_are_refused(device):
+    model = stack(device)
+    state, found, contacts = collided(model)
+    pairs = sorted(model.shape_collision_filter_pairs)
+    for other in ([*pairs, (1, 3)], [*pairs, (1, 2)][1:], pairs):
+        model._set_shape_collision_filter_pairs(other)
+        if other == pairs:
+            found.collide(state, contacts)
+            continue
+        refused(RuntimeError, r"^shape_collision_filter_pairs changed", found.collide, state, contacts)
+    model.shape_source[1] = newton_mesh(trimesh.Trimesh(2 * PART.vertices, PART.faces))
+    refused(RuntimeError, r"^shape_source changed", found.collide, state, contacts)
+
+
+def test_what_is_read_at_every_call_may_change(device):
+    """Transforms of shapes, whether one is drawn, and the sizes of shapes that are no meshes."""
+    model = stack(device)
+    state, found, contacts = collided(model)
+    before = len(contact_rows(contacts, "normal")[0])
+    change(model, "shape_flags", 2, int(model.shape_flags.numpy()[2]) ^ int(newton.ShapeFlags.VISIBLE))
+    change(model, "shape_scale", 3, (0.2, 0.0, 0.0))
+    change(model, "shape_transform", 1, (0.0, 0.0, 5.0, 0.0, 0.0, 0.0, 1.0))
+    found.collide(state, contacts)
+    (touched,) = contact_rows(contacts, "shape1")
+    assert 0 < len(touched) < before and 1 not in touched and 2 in touched
+
+
+@pytest.mark.parametrize("solids", [[True, False, True, False], np.array([True]), [0.5], "all"])
+def test_solids_are_indices(device, solids):
+    """A mask is no list of indices: it would make solids of shapes 0 and 1."""
+    said = r"^solids: .* is neither a bool nor indices of shapes$"
+    refused(ValueError, said, ab.NewtonContacts, stack(device), solids=solids)
+    assert not any(ab.NewtonContacts(stack(device), solids=[]).scene.object_solid)

@@ -1,32 +1,24 @@
-"""Newton's models in `NewtonContacts`: pairs, materials, particles, worlds; captures and order."""
+"""Newton's models in `NewtonContacts`: pairs, materials, particles, worlds, captures and order; nuts on bolts."""
+
+import importlib.util
+import pathlib
 
 import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from helpers import refused
+from helpers.bodies import at, collided, contact_rows, newton_mesh, settle, touching_shapes
 
 import warp_abtree as ab
 
 newton = pytest.importorskip("newton")
 
 
-def mesh_of(shape):
-    return newton.Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces).ravel())
-
-
-def lifted(z, x=0.0):
-    return wp.transform((x, 0.0, z), wp.quat_identity())
-
-
-CUBE, FLOOR = mesh_of(trimesh.creation.box((1, 1, 1))), mesh_of(trimesh.creation.box((8, 8, 1)))
-RING = mesh_of(trimesh.creation.torus(0.8, 0.25, 24, 12))
+CUBE, FLOOR = newton_mesh(trimesh.creation.box((1, 1, 1))), newton_mesh(trimesh.creation.box((8, 8, 1)))
+RING = newton_mesh(trimesh.creation.torus(0.8, 0.25, 24, 12))
+COLUMNS = ("shape0", "shape1", "point0", "point1", "offset0", "normal", "margin0")
 NEAR = newton.ModelBuilder.ShapeConfig(gap=0.01)
-
-
-def pairs_of(contacts):
-    count = int(contacts.rigid_contact_count.numpy()[0])
-    shapes = [getattr(contacts, f"rigid_contact_shape{k}").numpy()[:count] for k in (0, 1)]
-    return {tuple(sorted(pair)) for pair in np.stack(shapes, 1).tolist()}
 
 
 def test_pairs_are_those_of_newton(device):
@@ -36,7 +28,7 @@ def test_pairs_are_those_of_newton(device):
     for _ in range(3):
         world, last = newton.ModelBuilder(), None
         for _ in range(5):
-            body = -1 if rng.random() < 0.2 else world.add_link(xform=lifted(0.0))
+            body = -1 if rng.random() < 0.2 else world.add_link(xform=at())
             for _ in range(rng.integers(1, 3)):
                 config = newton.ModelBuilder.ShapeConfig(collision_group=int(rng.choice([-2, -1, 0, 1, 2])))
                 config.has_shape_collision = bool(rng.random() < 0.9)
@@ -80,22 +72,12 @@ def test_friction_is_that_of_the_shapes(device, mu, slides):
     slope = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), 0.4)
     config = newton.ModelBuilder.ShapeConfig(gap=0.01, mu=mu)
     builder = newton.ModelBuilder()
-    builder.add_shape_mesh(
-        -1, xform=wp.transform(wp.quat_rotate(slope, wp.vec3(0, 0, -0.5)), slope), mesh=FLOOR, cfg=config
-    )
-    body = builder.add_body(xform=wp.transform(wp.quat_rotate(slope, wp.vec3(0, 0, 0.5)), slope))
-    builder.add_shape_mesh(body, mesh=CUBE, cfg=config)
+    below, above = (wp.transform(wp.quat_rotate(slope, wp.vec3(0, 0, z)), slope) for z in (-0.5, 0.5))
+    builder.add_shape_mesh(-1, xform=below, mesh=FLOOR, cfg=config)
+    builder.add_shape_mesh(builder.add_body(xform=above), mesh=CUBE, cfg=config)
     model = builder.finalize(device=device)
-    found = ab.NewtonContacts(model)
-    solver, contacts, control = newton.solvers.SolverXPBD(model, iterations=8), found.contacts(), model.control()
-    state, after = model.state(), model.state()
-    begin = state.body_q.numpy()[0, :3].copy()
-    for _ in range(120):
-        state.clear_forces()
-        found.collide(state, contacts)
-        solver.step(state, after, control, contacts, 1 / 240)
-        state, after = after, state
-    way = np.linalg.norm(state.body_q.numpy()[0, :3] - begin)
+    poses, _ = settle(model, ab.NewtonContacts(model), 120, iterations=8)
+    way = np.linalg.norm((poses - model.state().body_q.numpy())[0, :3])
     # By friction alone it would slide 9.81 (sin - mu cos) t^2 / 2 = 0.25 m.
     assert 0.15 < way < 0.35 if slides else way < 0.03
 
@@ -103,15 +85,12 @@ def test_friction_is_that_of_the_shapes(device, mu, slides):
 @pytest.mark.slow  # Newton compiles much for it
 def test_particles_are_newtons(device):
     builder = newton.ModelBuilder()
-    builder.add_shape_mesh(-1, xform=lifted(-0.5), mesh=FLOOR, cfg=NEAR)
-    builder.add_shape_mesh(builder.add_body(xform=lifted(0.5)), mesh=CUBE, cfg=NEAR)
+    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=FLOOR, cfg=NEAR)
+    builder.add_shape_mesh(builder.add_body(xform=at(z=0.5)), mesh=CUBE, cfg=NEAR)
     builder.add_particle((3.0, 0.0, 0.05), (0.0, 0.0, 0.0), 1.0, radius=0.1)
-    model = builder.finalize(device=device)
-    found = ab.NewtonContacts(model)
-    contacts = found.contacts()
-    found.collide(model.state(), contacts)
+    _, _, contacts = collided(builder.finalize(device=device))
     assert contacts.soft_contact_count.numpy()[0] == 1
-    assert pairs_of(contacts) == {(0, 1)} and contacts.rigid_contact_count.numpy()[0] == 4
+    assert touching_shapes(contacts) == {(0, 1)} and contacts.rigid_contact_count.numpy()[0] == 4
 
 
 def test_worlds_have_meshes_of_their_own(device):
@@ -119,57 +98,43 @@ def test_worlds_have_meshes_of_their_own(device):
     builder = newton.ModelBuilder()
     for mesh, half in ((CUBE, 0.5), (RING, 0.25)):
         world = newton.ModelBuilder()
-        world.add_shape_mesh(-1, xform=lifted(-0.5), mesh=FLOOR, cfg=NEAR)
-        world.add_shape_mesh(world.add_body(xform=lifted(half + 0.005)), mesh=mesh, cfg=NEAR)
+        world.add_shape_mesh(-1, xform=at(z=-0.5), mesh=FLOOR, cfg=NEAR)
+        world.add_shape_mesh(world.add_body(xform=at(z=half + 0.005)), mesh=mesh, cfg=NEAR)
         builder.add_world(world)
-    model = builder.finalize(device=device)
-    found = ab.NewtonContacts(model)
-    contacts = found.contacts()
-    found.collide(model.state(), contacts)
-    assert pairs_of(contacts) == {(0, 1), (2, 3)}
-    count = int(contacts.rigid_contact_count.numpy()[0])
-    second = contacts.rigid_contact_shape1.numpy()[:count]
-    heights = contacts.rigid_contact_point1.numpy()[:count, 2]
-    np.testing.assert_allclose(heights[second == 1], -0.5, atol=0.004)
-    np.testing.assert_allclose(heights[second == 3], -0.25, atol=0.004)
-    radii = np.linalg.norm(contacts.rigid_contact_point1.numpy()[:count, :2], axis=1)
-    np.testing.assert_allclose(radii[second == 3], 0.8, atol=0.02)
+    _, _, contacts = collided(builder.finalize(device=device))
+    assert touching_shapes(contacts) == {(0, 1), (2, 3)}
+    second, points = contact_rows(contacts, "shape1", "point1")
+    np.testing.assert_allclose(points[second == 1, 2], -0.5, atol=0.004)
+    np.testing.assert_allclose(points[second == 3, 2], -0.25, atol=0.004)
+    np.testing.assert_allclose(np.linalg.norm(points[second == 3, :2], axis=1), 0.8, atol=0.02)
 
 
 def ring_model(device, count):
     builder = newton.ModelBuilder()
     builder.add_ground_plane()
-    builder.add_shape_mesh(-1, xform=lifted(0.5), mesh=FLOOR, cfg=NEAR)
+    builder.add_shape_mesh(-1, xform=at(z=0.5), mesh=FLOOR, cfg=NEAR)
     for k in range(count):
-        builder.add_shape_mesh(builder.add_body(xform=lifted(1.255 + 0.505 * k)), mesh=RING, cfg=NEAR)
-    builder.add_shape_sphere(builder.add_body(xform=lifted(0.295, 6.0)), radius=0.3, cfg=NEAR)
+        builder.add_shape_mesh(builder.add_body(xform=at(z=1.255 + 0.505 * k)), mesh=RING, cfg=NEAR)
+    builder.add_shape_sphere(builder.add_body(xform=at(6.0, z=0.295)), radius=0.3, cfg=NEAR)
     return builder.finalize(device=device)
-
-
-def rows_of(contacts):
-    count = int(contacts.rigid_contact_count.numpy()[0])
-    names = ("shape0", "shape1", "point0", "point1", "offset0", "normal", "margin0")
-    return [getattr(contacts, f"rigid_contact_{name}").numpy()[:count].copy() for name in names]
 
 
 def test_contacts_keep_their_order_as_bodies_move(device):
     """Row by row the same pair and nearly the same point, so that what a solver keeps of a row still fits."""
     model = ring_model(device, 3)
-    found, state = ab.NewtonContacts(model), model.state()
-    contacts = found.contacts()
-    found.collide(state, contacts)
-    before = rows_of(contacts)
+    state, found, contacts = collided(model)
+    before = contact_rows(contacts, *COLUMNS)
     poses = state.body_q.numpy().copy()
     for _ in range(4):
         poses[:, :3] += np.float32(1e-4)
         state.body_q.assign(poses)
         found.collide(state, contacts)
-        rows = rows_of(contacts)
+        rows = contact_rows(contacts, *COLUMNS)
         assert rows[0].tolist() == before[0].tolist() and rows[1].tolist() == before[1].tolist()
         np.testing.assert_allclose(rows[3], before[3], atol=0.01)
-        again = rows_of(contacts)
+        again = contact_rows(contacts, *COLUMNS)
         found.collide(state, contacts)
-        for one, two in zip(again, rows_of(contacts)):
+        for one, two in zip(again, contact_rows(contacts, *COLUMNS)):
             np.testing.assert_array_equal(one, two)
 
 
@@ -197,15 +162,60 @@ def test_collide_in_a_capture_launches_only(device):
         ends.append(state.body_q.numpy().copy())
     assert np.abs(ends[0][:, 2] - model.body_q.numpy()[:, 2]).max() > 1e-4
     np.testing.assert_array_equal(*ends)
-    with pytest.raises(ValueError, match="another size"):
-        found.launch(state, newton.Contacts(7, 0, device=device))
+    refused(ValueError, "another size", found.launch, state, newton.Contacts(7, 0, device=device))
 
 
 def test_a_surface_that_moves_is_refused(device):
-    mesh = mesh_of(trimesh.creation.box((1, 1, 1)))
+    mesh = newton_mesh(trimesh.creation.box((1, 1, 1)))
     mesh.enable_surface_velocity = True
     builder = newton.ModelBuilder()
     builder.add_shape_mesh(-1, mesh=FLOOR)
     builder.add_shape_mesh(builder.add_body(), mesh=mesh)
-    with pytest.raises(ValueError, match="surface of shape 1 moves"):
-        ab.NewtonContacts(builder.finalize(device=device))
+    refused(ValueError, "surface of shape 1 moves", ab.NewtonContacts, builder.finalize(device=device))
+
+
+pytest.importorskip("newton")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    path = pathlib.Path(__file__).parents[2] / "scenes/newton_nut_and_bolt.py"
+    spec = importlib.util.spec_from_file_location("newton_nut_and_bolt", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def make_nuts(scene, solver, device, count, hammer=0.0, tolerance=None):
+    parts = scene.make_bolt(16, 6), scene.make_nut(16, 3)
+    assert all(trimesh.Trimesh(*part).is_volume and trimesh.Trimesh(*part).volume > 0 for part in parts)
+    bolt, nut = (ab.Model.from_arrays(*part) for part in parts)
+    height = scene.find_height(bolt, nut, scene.PITCH, 2 * scene.PITCH)
+    model = scene.build_model(bolt, nut, height, scene.PITCH, count, device)
+    return scene.Nuts(model, bolt, nut, solver, scene.PITCH, hammer, tolerance=tolerance)
+
+
+def test_hammered_nuts_stay_on_their_threads(scene, device):
+    """At most the thread's play off it, while a blow alone would carry a nut through most of a pitch in a step."""
+    nuts = make_nuts(scene, "xpbd", device, 2, 0.5)
+    nuts.run(0.3)
+    assert (nuts.turned < -0.1).all() and abs(np.subtract(*nuts.turned)) > 0.001, "each has a speed of its own"
+    assert (nuts.lag < scene.PITCH / 8).all(), nuts.lag
+
+
+def test_nuts_at_lods_within_a_tolerance_stay_on_their_threads(scene, device):
+    nuts = make_nuts(scene, "xpbd", device, 2, 0.5, tolerance=4e-5)
+    assert (nuts.found.scene.lods < [model.lod_max for model in nuts.found.scene.models * 2]).all()
+    nuts.run(0.2)
+    assert (nuts.turned < -0.05).all() and (nuts.lag < scene.PITCH / 8).all(), nuts.lag
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", ["xpbd", "mujoco"])
+def test_nuts_follow_the_pitch(scene, device, solver):
+    if solver == "mujoco":
+        pytest.importorskip("mujoco_warp")
+    nuts = make_nuts(scene, solver, device, 1)
+    nuts.run(1.5)
+    assert (nuts.turned < -1).all()
+    np.testing.assert_allclose(nuts.travel(), 1, atol=0.05)

@@ -6,18 +6,17 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from helpers import refused
 from helpers.samples import random_poses
+from helpers.scenes import scene_with
 
 import warp_abtree as ab
 
 
 @pytest.fixture
 def scene(device):
-    scene = ab.Scene(device)
     ring = ab.Model.load(trimesh.creation.torus(0.6, 0.2, 16, 8))
-    for k in range(6):
-        scene.add(ring, pose=(0.3 * k, 0, 0, 0, 0, 0, 1))
-    return scene
+    return scene_with(device, *[(ring, (0.3 * k, 0, 0, 0, 0, 0, 1)) for k in range(6)])
 
 
 def poses_of(seed, count=6):
@@ -26,9 +25,7 @@ def poses_of(seed, count=6):
 
 def expected(scene, poses):
     """Answers of another scene, whose poses go through the host."""
-    other = ab.Scene(scene.device)
-    for pose in poses:
-        other.add(scene.models[0], pose=pose)
+    other = scene_with(scene.device, *[(scene.models[0], pose) for pose in poses])
     return other.intersect(other.broad_phase(), output="count")
 
 
@@ -51,8 +48,7 @@ def test_bad_rows_leave_their_objects_and_the_poses_of_the_input(scene, real):
     rows = poses_of(1).astype(real)
     rows[2, 0], rows[4, 3:] = np.nan, 0.51
     poses.launch(rows if scene.device.is_cpu else wp.array(rows, device=scene.device))
-    with pytest.raises(ValueError, match=r"2 rows .* object that had one is 2"):
-        poses.check()
+    refused(ValueError, r"2 rows .* object that had one is 2", poses.check)
     kept = rows.astype(np.float64)
     kept[[2, 4]] = before[[2, 4]]
     assert_same(scene, query, kept)
@@ -99,21 +95,18 @@ def test_poses_that_are_refused(scene):
     ]
     cases += [(good, "on cpu, the scene is on cuda")] if scene.device.is_cuda else []
     for bad, message in cases:
-        with pytest.raises(ValueError, match=message):
-            poses.launch(bad)
+        refused(ValueError, message, poses.launch, bad)
     poses.launch(wp.array(good, dtype=wp.float64, device=scene.device))
     rows = poses_of(6)
     rows[2, 3:] *= 1.01
     rows[4, 0] = math.nan
     poses.launch(wp.array(rows, dtype=wp.float64, device=scene.device))
-    with pytest.raises(ValueError, match=r"2 rows since the last check.* first object that had one is 2"):
-        poses.check()
+    refused(ValueError, r"2 rows since the last check.* first object that had one is 2", poses.check)
     poses.check()
     rows[[2, 4]] = good[[2, 4]]
     assert_same(scene, ab.Query(scene, "count"), rows)
     scene.add(scene.models[0])
-    with pytest.raises(RuntimeError, match="make a new one"):
-        poses.launch()
+    refused(RuntimeError, "make a new one", poses.launch)
 
 
 def numpy_array(rows, device):

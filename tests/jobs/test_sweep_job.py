@@ -1,12 +1,32 @@
-"""A pair of models at many poses: shards have the answers of one scene or call, and bad input is named."""
+"""A pair of models at many poses: answers of scenes and calls, bad input, and the same bytes on a local Ray."""
+
+import json
+import os
+import signal
+import sys
 
 import numpy as np
 import pytest
-from helpers.jobs import intersect, lods_of, pair, poses_of, read, run
+from helpers import refused
+from helpers.jobs import (
+    ColumnJob,
+    contents,
+    intersect,
+    job_of,
+    lods_of,
+    pair,
+    poses_of,
+    read,
+    run,
+    shard_at,
+    stop_after,
+)
 from helpers.samples import sample
+from helpers.viewer import run_command
 
 import warp_abtree as ab
-from warp_abtree.jobs import SweepJob, sweep_job
+from warp_abtree.app.cli import sweep_command
+from warp_abtree.jobs import RayPool, SweepJob, run_shards, sweep_job
 
 
 @pytest.mark.parametrize("output", ["any", "count", "faces", "contacts"])
@@ -78,7 +98,136 @@ def test_bad_input_is_named(tmp_path, monkeypatch):
         (poses_of(), {"precision": "good"}, "precision 'good'"),
         (poses_of(), {"shard": 0}, "shard 0 is outside"),
     ):
-        with pytest.raises(ValueError, match=what):
-            SweepJob(*pair(), poses, **options)
-    with pytest.raises(TypeError, match="not a Model"):
-        SweepJob("torus", sample("torus"), poses_of())
+        refused(ValueError, what, SweepJob, *pair(), poses, **options)
+    refused(TypeError, "not a Model", SweepJob, "torus", sample("torus"), poses_of())
+
+
+@pytest.fixture
+def sweep(tmp_path, monkeypatch, capsys):
+    """Give a function that sweeps in a folder with two models, poses and LODs, and returns what it prints as JSON."""
+    monkeypatch.chdir(tmp_path)
+    for name, model in zip("ab", pair()):
+        model.save(f"{name}.npz")
+    np.save("poses.npy", poses_of())
+    np.save("lods.npy", lods_of(100))
+
+    def sweep(words, here="--ray none --device cpu", status=0):
+        shown, errors = run_command(capsys, "sweep", *words.split(), *here.split(), "--json", status=status)
+        return json.loads(shown) if shown else None, errors
+
+    return sweep
+
+
+def test_answers_are_those_of_the_calls(sweep, tmp_path):
+    first, second = pair()
+    asked = "a.npz b.npz poses.npy --out out --shard 30 --output count"
+    assert sweep(asked)[0]["shards"] == 4 and sweep(asked)[0]["kept"] == 4
+    expected = ab.sweep(first, second, poses_of(), output="count", device="cpu")
+    np.testing.assert_array_equal(read(tmp_path / "out")["count"], expected)
+    sweep("a.npz b.npz poses.npy --out lods --lods lods.npy")
+    expected = intersect("cpu", poses_of(), lods_of(100), "any").any
+    np.testing.assert_array_equal(read(tmp_path / "lods")["any"], expected)
+    sweep("a.npz a.npz poses.npy --out half --lod-a 0.5")
+    expected = ab.sweep(first, first, poses_of(), first.lod_for(fraction=0.5), device="cpu")
+    np.testing.assert_array_equal(read(tmp_path / "half")["any"], expected)
+
+
+def test_shards_that_stay_are_counted(sweep, tmp_path):
+    words = "a.npz b.npz poses.npy --out out --shard 40"
+    for place, text, counts in ((0, None, (3, 0, 0)), (0, b"PK", (3, 2, 1)), (2, b"", (3, 2, 1))):
+        if text is not None:
+            shard_at(tmp_path / "out", place).write_bytes(text)
+        found = sweep(words)[0]
+        assert (found["shards"], found["kept"], found["damaged"]) == counts
+
+
+@pytest.mark.parametrize("output", ["any", "count", "faces", "contacts"])
+def test_intersecting_poses_are_counted(sweep, tmp_path, output):
+    """Those of shards that were there already, too, and of damaged ones once."""
+    words = f"a.npz b.npz poses.npy --out out --shard 40 --output {output}"
+    expected = int(ab.sweep(*pair(), poses_of(), device="cpu").sum())
+    assert 0 < expected < 100
+    for damage in (False, False, True):
+        if damage:
+            shard_at(tmp_path / "out", 1).write_bytes(b"PK")
+        found = sweep(words)[0]
+        assert (found["count"], found["intersecting"], found["unit"]) == (100, expected, "pose")
+
+
+def test_without_ray_one_line_says_so(sweep, tmp_path, monkeypatch):
+    monkeypatch.setattr(sweep_command.importlib.util, "find_spec", lambda name: None)
+    asked = "a.npz a.npz poses.npy --out out"
+    assert sweep(asked, "")[1] == ["Ray is not installed (pip install ray): this process does all shards"]
+    assert len(read(tmp_path / "out")["any"]) == 100
+    _, (error,) = sweep(asked, "--workers 2", status=2)
+    assert "need Ray" in error
+
+
+@pytest.fixture(scope="module")
+def pool():
+    pytest.importorskip("ray")
+    with RayPool(workers=2) as made:
+        yield made
+
+
+def check_against_one_process(job, folder, pool, **options):
+    """Run a job on Ray and in this process; return what the former reports."""
+    run(job, folder / "plain", device="cuda:0" if pool.on_gpus else "cpu")
+    done = run_shards(job, folder / "ray", pool=pool, **options)
+    assert contents(folder / "ray") == contents(folder / "plain")
+    return done
+
+
+@pytest.mark.parametrize("output", ["count", "contacts"])
+def test_ray_writes_the_same_bytes(tmp_path, pool, output):
+    done = check_against_one_process(job_of(output, count=400, shard=25), tmp_path, pool)
+    assert (done["shards"], done["workers"], done["lost"]) == (16, 2, 0)
+
+
+def test_a_killed_worker_is_replaced(tmp_path, pool):
+    killed = []
+
+    def kill(_, done, total):
+        if done >= 5 and not killed and pool.pids:
+            killed.append(next(iter(pool.pids.values())))
+            os.kill(killed[0], signal.SIGKILL)
+
+    done = check_against_one_process(job_of("faces", count=400, shard=10), tmp_path, pool, progress=kill)
+    assert killed and done["lost"] == 1
+
+
+def test_an_interrupted_run_continues(tmp_path, pool):
+    job = job_of(count=400, shard=10)
+    with pytest.raises(KeyboardInterrupt):
+        run_shards(job, tmp_path / "ray", pool=pool, progress=stop_after(7))
+    assert check_against_one_process(job, tmp_path, pool)["kept"] == 7
+
+
+class FailingJob(ColumnJob):
+    """Fails, or ends its worker, at one task."""
+
+    def run(self, task, device=None):
+        if task[0] == 20 and self.output == "end":
+            os._exit(1)
+        if task[0] == 20:
+            raise ValueError("no such task: 20")
+        return super().run(task)
+
+
+@pytest.mark.parametrize(
+    ("how", "error", "what"),
+    [
+        ("end", RuntimeError, r"shard \(20, 30\) ended its worker, 3 times"),
+        ("fail", ValueError, "^no such task: 20$"),
+    ],
+)
+def test_a_shard_that_cannot_be_computed_is_given_up(tmp_path, pool, how, error, what):
+    for module in (__name__, ColumnJob.__module__):  # workers cannot import the tests
+        pool.ray.cloudpickle.register_pickle_by_value(sys.modules[module])
+    refused(error, what, run_shards, FailingJob(count=40, shard=10, output=how), tmp_path / "out", pool=pool)
+    assert not (tmp_path / "out" / "shard-000000000020-000000000030.npz").exists()
+
+
+@pytest.mark.parametrize("workers", [0, -1, 1.5])
+def test_workers_are_counted_from_one(workers):
+    refused(ValueError, f"^workers {workers} is ", RayPool, workers=workers)

@@ -1,15 +1,24 @@
 """Selection of LODs on the device against plain Python written from section 4.2 of the paper and from figure 4."""
 
+import math
+from fractions import Fraction
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
+from helpers import refused
 from helpers.bodies import selection_models, strewn
+from helpers.samples import grid
+from helpers.scenes import scene_with
+from oracles.distance import brute_distances, exact_distance_sq, lattice_points
 
-import warp_abtree as ab
 from warp_abtree.lod.controllers import Feedback, PaperController, PredictiveController, ToleranceController
-from warp_abtree.lod.view import Camera
+from warp_abtree.lod.view import Camera, View
+from warp_abtree.model import lod_bounds
+from warp_abtree.model.progressive import build_progressive
 from warp_abtree.state.ladder import Ladder
 
 # Figure 4 by hand: g in frames 1 to 10, Case 1 until frame 5 and Case 2 from frame 6. Rows are Q1, Q2, Q3.
@@ -76,9 +85,7 @@ def run_paper(scene, costs, start=0.0, focus=None, **options):
 
 
 def test_figure_4(device):
-    scene = ab.Scene(device=device)
-    for importance in (1, 2, 3):
-        scene.add(selection_models()[0], importance=importance)
+    scene = scene_with(device, *[(selection_models()[0], {"importance": importance}) for importance in (1, 2, 3)])
     # Room on both sides, so that no end of the ladder hides a step.
     levels, _ = run_paper(scene, [5.0] * 5 + [15.0] * 5, steps=400, start=200.0)
     moved = np.diff(levels, axis=0).T
@@ -112,9 +119,6 @@ def test_selection_follows_the_paper(device, threshold):
     assert levels.max() == 50 and (levels[1:] == 0).any()
 
 
-# Ladders.
-
-
 def test_ratio_ladder_has_equal_ratios():
     models = selection_models()
     ladder = Ladder(models, 20, "ratio")
@@ -124,9 +128,6 @@ def test_ratio_ladder_has_equal_ratios():
         assert (faces >= wanted * (1 - 1e-9)).all()
         for level in range(1, 20):  # a coarser LOD would not do
             assert lods[level] == 0 or len(model.mesh_at(int(lods[level]) - 1)[2]) < wanted[level]
-
-
-# Tolerances.
 
 
 def test_tolerance_gives_the_coarsest_level_within_it(device):
@@ -165,8 +166,7 @@ def test_tolerance_gives_the_coarsest_level_within_it(device):
     ],
 )
 def test_controllers_refuse(make, error, words):
-    with pytest.raises(error, match=words):
-        make(strewn(3, "cpu"))
+    refused(error, words, make, strewn(3, "cpu"))
 
 
 def test_a_controller_refuses_another_scene_than_it_was_made_for(device):
@@ -174,11 +174,7 @@ def test_a_controller_refuses_another_scene_than_it_was_made_for(device):
     controller = PaperController(scene, 8.0)
     scene.add(selection_models()[0])
     for call in (controller.view.launch, lambda: controller.next_lods(Feedback(0.0))):
-        with pytest.raises(RuntimeError, match="objects were added"):
-            call()
-
-
-# Graphs.
+        refused(RuntimeError, "objects were added", call)
 
 
 @pytest.mark.parametrize("kind", [PaperController, ToleranceController, PredictiveController])
@@ -211,3 +207,121 @@ def test_selection_runs_in_a_captured_graph(device, kind):
         assert np.array_equal(captured.view.motion.numpy(), plain.view.motion.numpy())
         seen.append(tuple(lods))
     assert len(set(seen)) > 2
+
+
+def f_printed(alpha, gamma, far, wide):
+    return min(max(min((far - alpha) / far, (wide - gamma) / wide), 0.0), 1.0)
+
+
+def see(camera, point):
+    """Project by a 4x4 view matrix; return the distance, and the place on the screen or None behind the camera."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = camera.view
+    matrix[:3, 3] = -camera.view @ camera.eye
+    x, y, z, _ = matrix @ [*point, 1.0]
+    scale = camera.size[1] / 2 / math.tan(camera.field_of_view / 2)
+    place = None if z >= 0 else np.array([scale * x / -z, scale * y / -z])
+    return math.dist(point, camera.eye), place
+
+
+def test_camera_looks_where_it_is_told():
+    camera = Camera.look_at((0, 0, 5), (0, 0, 0), size=(200, 100), field_of_view=math.pi / 2)
+    assert np.array_equal(camera.view, np.eye(3))
+    assert np.allclose(see(camera, (1, 2, 0))[1], [10, 20])
+    tilted = Camera.look_at((3, 1, -2), (0, 2, 7), up=(0.1, 1, 0))
+    assert np.allclose(tilted.view @ (np.array([0, 2, 7]) - [3, 1, -2]), [0, 0, -math.sqrt(91)])
+    assert (tilted.view @ [0.1, 1, 0])[1] > 0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "what"),
+    [
+        ({"eye": (0, 0)}, "eye"),
+        ({"eye": (0, 0, math.nan)}, "eye"),
+        ({"view": 2 * np.eye(3)}, "view"),
+        ({"view": np.diag([1.0, 1.0, -1.0])}, "view"),
+        ({"field_of_view": 0.0}, "field_of_view"),
+        ({"field_of_view": math.pi}, "field_of_view"),
+        ({"size": (0, 10)}, "size"),
+        ({"far": -1.0}, "far"),
+        ({"far": math.inf}, "far"),
+        ({"target": (0, 0, 1)}, "looks"),
+        ({"target": (0, 3, 1)}, "looks"),
+    ],
+)
+def test_camera_refuses(wrong, what):
+    with pytest.raises(ValueError, match=what):
+        if "target" in wrong:
+            Camera.look_at((0, 0, 1), **wrong)
+        Camera(**{"eye": (0, 0, 1), "view": np.eye(3), **wrong})
+
+
+def test_view_measures_distance_motion_and_focus(device):
+    """Moving objects, a moving camera, objects beyond D, behind the eye, and passing it."""
+    rng = np.random.default_rng(2)
+    scene = strewn(40, device)
+    view = View(scene, window=3)
+    ways, last, before = [], [None] * 40, 0
+    for _ in range(8):
+        camera = Camera.look_at(rng.uniform(-1, 1, 3), rng.uniform(-5, 5, 3), size=(320, 240), far=3.5)
+        poses = np.concatenate([rng.uniform(-4, 4, (40, 3)), rng.normal(size=(40, 4))], axis=1)
+        poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+        scene.set_poses(poses)
+        view.look(camera)
+        view.launch()
+        rotation = trimesh.transformations
+        alpha, way = np.empty(40), np.zeros(40)
+        for i in range(40):
+            x, y, z, w = poses[i, 3:]
+            turn = rotation.quaternion_matrix([w, x, y, z])[:3, :3]
+            centre = scene.models[scene.object_model[i]].centre
+            alpha[i], place = see(camera, turn @ centre + poses[i, :3])
+            if place is not None and last[i] is not None:
+                way[i] = math.dist(place, last[i])
+            last[i] = place
+        ways.append(way)
+        gamma = np.sum(ways[-3:], axis=0)
+        focus = [f_printed(a, g, 3.5, 400.0) for a, g in zip(alpha, gamma)]
+        assert np.allclose(view.distance.numpy(), alpha, rtol=1e-12)
+        assert np.allclose(view.motion.numpy(), gamma, rtol=1e-9)
+        assert np.allclose(view.focus.numpy(), focus, atol=1e-9)
+        before += sum(place is None for place in last)
+    assert 0 < before < 8 * 40 and (alpha > 3.5).any() and 0 < np.mean(np.array(focus) > 0) < 1
+
+
+def bumpy_sheet(size, height, seed):
+    """A grid of squares with bumps."""
+    vertices, faces = grid(size)
+    vertices += np.random.default_rng(seed).uniform(-height, height, vertices.shape)
+    return SimpleNamespace(vertices=vertices, faces=faces.astype(np.int32))
+
+
+def test_no_vertex_lies_beyond_the_error():
+    """The vertex that decides the error is measured with roundings, and would lie beyond it by some of them."""
+    close = 0
+    for seed in range(6):
+        progressive = build_progressive(bumpy_sheet(2, 0.3, seed), base_faces=1)
+        original = [[Fraction(x) for x in p] for p in progressive.vertex_pos[: progressive.vertex_count].tolist()]
+        for lod in range(progressive.lod_max):
+            vertices, faces, _ = progressive.mesh_at(lod)
+            farthest = max(exact_distance_sq(p, vertices[faces]) for p in original)
+            bound = Fraction(float(progressive.lod_error[lod])) ** 2
+            assert farthest <= bound
+            close += farthest > bound * (1 - Fraction(2) ** -36)
+    assert close > 10, "elsewhere no vertex decides the error"
+
+
+@pytest.mark.parametrize("slots", [0, 1, 8, 40])
+def test_covers_on_fewer_faces_than_they_want_are_measured_again(slots, monkeypatch):
+    """Polygons that find no slot stand on a face that is used already, perhaps a far one, and the bound must say so."""
+    mesh, looser = bumpy_sheet(8, 0.3, 1), 0
+    plenty = build_progressive(mesh, base_faces=1, certify=True)
+    monkeypatch.setattr(lod_bounds, "SLOTS_PER_FACE", 0)
+    monkeypatch.setattr(lod_bounds, "SLOTS_EXTRA", slots)
+    progressive = build_progressive(mesh, base_faces=1)
+    points = lattice_points(plenty.vertex_pos[mesh.faces], 4)
+    for lod in range(0, progressive.lod_max, 5):
+        vertices, faces, _ = progressive.mesh_at(lod)
+        assert brute_distances(points, vertices[faces]).max() <= progressive.lod_error[lod] + 1e-13
+        looser += progressive.lod_error[lod] > plenty.lod_error[lod]
+    assert looser > 0, "there is no want of slots here"

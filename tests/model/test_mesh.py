@@ -1,24 +1,26 @@
-"""Meshes of arrays: welding, validation and description."""
+"""Meshes of arrays, files and trimesh objects: welded, described, in their order; one error for what is unreadable."""
 
+import gzip
 import json
+import sys
 
 import hypothesis.extra.numpy as hnp
 import hypothesis.strategies as st
 import numpy as np
 import pytest
 import trimesh
+from helpers import refused
 from hypothesis import example, given
 
-from warp_abtree.model.mesh import MeshError, describe_mesh, mesh_from_arrays
+from warp_abtree.model.files.found import Remarks
+from warp_abtree.model.files.obj import read_obj
+from warp_abtree.model.mesh import MeshError, describe_mesh, load_mesh, mesh_from_arrays
 
 V, F = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
 
 
 def describe(vertices, faces):
     return describe_mesh(mesh_from_arrays(vertices, faces))
-
-
-# Welding.
 
 
 def test_tiny_coordinates_become_zero_and_far_ones_are_refused():
@@ -49,12 +51,10 @@ def test_random_soups(soup):
     corners = [{tuple(x + 0.0) for x in vertices[face]} for face in faces]
     dropped = [f for f, corner in enumerate(corners) if len(corner) < 3]
     if len(dropped) == len(faces):
-        with pytest.raises(MeshError, match="three distinct corners"):
-            mesh_from_arrays(vertices, faces)
+        refused(MeshError, "three distinct corners", mesh_from_arrays, vertices, faces)
         return
     if np.ptp(vertices[faces].reshape(-1, 3), axis=0).max() < 2.0**-100:
-        with pytest.raises(MeshError, match="extent"):
-            mesh_from_arrays(vertices, faces)
+        refused(MeshError, "extent", mesh_from_arrays, vertices, faces)
         return
     mesh = mesh_from_arrays(vertices, faces)
     np.testing.assert_array_equal(mesh.vertices[mesh.faces], vertices[faces])
@@ -65,7 +65,6 @@ def test_random_soups(soup):
     assert mesh.file_vertex_count == mesh.unreferenced_count + mesh.welded_count + len(mesh.vertices)
     first = [min(i for i in set(faces.ravel().tolist()) if (vertices[i] == x).all()) for x in mesh.vertices]
     assert first == sorted(first)
-
     # The description against sets and dictionaries.
     report = describe_mesh(mesh)
     kept = [tuple(face) for f, face in enumerate(mesh.faces.tolist()) if f not in dropped]
@@ -79,9 +78,6 @@ def test_random_soups(soup):
         joined = [group for group in groups if group & set(face)]
         groups = [group for group in groups if group not in joined] + [set(face).union(*joined)]
     assert report["components"] == len(groups)
-
-
-# Description.
 
 
 def test_describe_cube():
@@ -118,8 +114,6 @@ def test_components_of_shuffled_chains():
     assert describe(vertices, order[faces.reshape(-1, 3)])["components"] == chains
 
 
-# Errors.
-
 BIG = np.broadcast_to(np.array([0, 1, 2], dtype=np.int32), (2**30 + 1, 3))
 
 
@@ -147,10 +141,8 @@ BIG = np.broadcast_to(np.array([0, 1, 2], dtype=np.int32), (2**30 + 1, 3))
     ],
 )
 def test_array_errors(vertices, faces, message, recwarn):
-    with pytest.raises(MeshError, match=message) as caught:
-        mesh_from_arrays(vertices, faces, name="thing")
-    assert str(caught.value).startswith("thing: ")
-    assert "\n" not in str(caught.value)
+    caught = refused(MeshError, message, mesh_from_arrays, vertices, faces, name="thing")
+    assert str(caught).startswith("thing: ")
     assert not recwarn.list
 
 
@@ -159,3 +151,200 @@ def test_limits_are_included_and_integral_floats_pass():
         mesh_from_arrays(np.array(V) * scale, F)
     assert mesh_from_arrays(V, np.array(F, np.float32)).faces.tolist() == F
     assert mesh_from_arrays(np.array(V, np.int8), np.array(F, np.uint8)).faces.tolist() == F
+
+
+STL = b"solid\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+
+
+def ball():
+    """Return an icosphere whose coordinates float32 holds, so that every format can keep them."""
+    shape = trimesh.creation.icosphere(subdivisions=2)
+    return trimesh.Trimesh(shape.vertices.astype(np.float32).astype(float), shape.faces, process=False)
+
+
+@pytest.mark.parametrize("extension", ["obj", "ply", "stl", "off", "glb", "obj.gz", "stl.gz", "ply.gz", "STL"])
+def test_formats_keep_every_triangle(tmp_path, extension):
+    shape, path = ball(), tmp_path / f"some.ball.{extension}"
+    kind = extension.lower().removesuffix(".gz")
+    data = shape.export(file_type=kind, **({"digits": 17} if kind in ("obj", "off") else {}))
+    data = data.encode() if isinstance(data, str) else data
+    path.write_bytes(gzip.compress(data) if extension.endswith(".gz") else data)
+    mesh = load_mesh(path)
+    np.testing.assert_array_equal(mesh.vertices[mesh.faces], shape.vertices[shape.faces])
+    assert mesh.name == "some.ball" and load_mesh(str(path), name="x").name == "x"
+    assert (mesh.vertices.dtype, mesh.faces.dtype, mesh.dropped_faces.dtype) == (np.float64, np.int32, np.int32)
+    assert len(mesh.vertices) == len(shape.vertices) and len(mesh.dropped_faces) == 0
+    if kind == "stl":
+        assert mesh.file_vertex_count == 3 * len(shape.faces)
+        assert mesh.welded_count == 3 * len(shape.faces) - len(shape.vertices)
+    else:
+        np.testing.assert_array_equal(mesh.vertices, shape.vertices)
+        np.testing.assert_array_equal(mesh.faces, shape.faces)
+
+
+OBJ = """mtllib absent.mtl
+v 0 0 0\r
+v 1 0 0 1.0
+v 1 1 0 0.5 0.5 0.5  # a colour
+v 0 1 0
+vt 0 0
+vt 1 0
+vn 0 0 1
+o first
+usemtl red
+f 1/1/1 2/2/1 3/1/1 4/2/1
+usemtl blue
+f 1//1 2//1 \\
+  3//1
+usemtl red
+f 3/1 2/2 1/1   # reversed
+g second
+v 5 5 5
+v 6 5 5
+v 5 6 5
+f -3 -2 -1
+v 5 5 6
+f -4 -3 -1
+l 1 2
+p 1
+"""
+
+
+@pytest.mark.parametrize("extension", ["obj", "obj.gz"])
+@pytest.mark.parametrize("faces", ["f 1 2 3\nf 1 3 4\n", "f 1 2 3 4\n"])
+def test_a_byte_order_mark_costs_no_vertex(tmp_path, extension, faces):
+    """Windows editors write one, plain files and others."""
+    data = b"\xef\xbb\xbf" + f"v 0 0 7\nv 1 0 0\nv 1 1 0\nv 0 1 0\n{faces}".encode()
+    (tmp_path / f"square.{extension}").write_bytes(gzip.compress(data) if extension.endswith(".gz") else data)
+    mesh = load_mesh(tmp_path / f"square.{extension}")
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]] and mesh.vertices[0].tolist() == [0, 0, 7]
+
+
+def test_obj_keeps_the_order_of_the_file(tmp_path):
+    path = tmp_path / "order.obj"
+    path.write_text(OBJ)
+    mesh = load_mesh(path)
+    expected = [[0, 1, 2], [0, 2, 3], [0, 1, 2], [2, 1, 0], [4, 5, 6], [4, 5, 7]]
+    np.testing.assert_array_equal(mesh.faces, expected)
+    np.testing.assert_array_equal(mesh.vertices[[2, 7]], [[1, 1, 0], [5, 5, 6]])
+
+
+@pytest.mark.parametrize("turned", range(6))
+@pytest.mark.parametrize("flip", [1, -1])
+def test_polygons_that_are_not_convex_do_not_fold(tmp_path, turned, flip):
+    ring = np.roll([[0, 0], [2, 0], [2, 2], [1, 2], [1, 1], [0, 1]], turned, axis=0)[::flip]
+    for axes in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):
+        vertices = np.column_stack([ring, 0.5 * ring[:, 0]])[:, axes].astype(float)
+        path = tmp_path / "bend.obj"
+        path.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in vertices) + "f 1 2 3 4 5 6\n")
+        mesh = load_mesh(path)
+        a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
+        cross = np.cross(b - a, c - a)
+        # Areas add up only if no triangle folds over: the bend has area 3, times the slope's 1.118.
+        assert len(cross) == 4
+        assert np.linalg.norm(cross, axis=1).sum() / 2 == pytest.approx(3 * np.hypot(1, 0.5))
+        outline = np.linalg.norm(np.cross(vertices, np.roll(vertices, -1, axis=0)).sum(axis=0)) / 2
+        assert np.linalg.norm(cross.sum(axis=0)) / 2 == pytest.approx(outline)
+
+
+def test_trimesh_and_scene():
+    shape = ball()
+    mesh = load_mesh(shape, name="ball")
+    np.testing.assert_array_equal(mesh.vertices, shape.vertices)
+    np.testing.assert_array_equal(mesh.faces, shape.faces)
+    assert mesh.name == "ball"
+    scene = trimesh.Scene()
+    scene.add_geometry(shape, node_name="here")
+    mirror = np.array([[0, -1, 0, 4], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], float)
+    scene.add_geometry(shape, node_name="there", transform=mirror)
+    scene.add_geometry(trimesh.PointCloud([[9.0, 9.0, 9.0]]))
+    joined = load_mesh(scene)
+    count = len(shape.faces)
+    np.testing.assert_array_equal(joined.vertices[joined.faces[:count]], shape.vertices[shape.faces])
+    mirrored = shape.vertices[shape.faces][:, ::-1][..., [1, 2, 0]] * [-1, 1, 1] + [4, 0, 0]
+    np.testing.assert_array_equal(joined.vertices[joined.faces[count:]], mirrored)
+    assert describe_mesh(joined)["components"] == 2
+
+
+@pytest.mark.parametrize("name, faces", [("bunny", 12200), ("bear", 3968), ("rocks", 10870)])
+def test_warp_meshes(name, faces):
+    pytest.importorskip("pxr")
+    mesh = load_mesh(f"warp:{name}")
+    report = describe_mesh(mesh)
+    assert (report["name"], report["faces"], report["closed"]) == (name, faces, True)
+    # Closed and without folds: the areas of the two sides of every axis cancel.
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
+    assert np.abs(np.cross(b - a, c - a).sum(axis=0)).max() < 1e-9 * report["diagonal"] ** 2
+
+
+CORNER_LINES = b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+
+
+@pytest.mark.parametrize(
+    "file, data, message",
+    [
+        ("a.obj", CORNER_LINES, "no faces"),
+        ("a.obj", b"v 0 0 0\nv 1 0 x\n", "line 2 cannot be read"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nf 1 2\n", "line 3 cannot be read"),
+        ("a.obj", b"v 0 0 0\nf 1 2 -2\n", "line 2 refers to a vertex before the first"),
+        ("a.obj", b"f 1 2 3\n", "no vertices"),
+        ("a.obj", CORNER_LINES.replace(b"1 0 0", b"nan 0 0") + b"f 1 2 3\n", "vertex 1 is not finite"),
+        ("a.obj.gz", b"not gzip at all", "cannot be read"),
+        ("a.obj.gz", gzip.compress(OBJ.encode(), mtime=0)[:-20], "cannot be read"),
+        ("a.stl", b"solid x\nfacet\nendsolid", "no faces"),
+        ("a.stl", STL + b"vertex x 0 0\nvertex 1 0 0\nvertex 0 1 0\n\nendsolid", "cannot be read as stl"),
+        ("a.ply", b"not a ply", "cannot be read as ply"),
+        ("a.docx", b"", "unknown extension 'docx'; known here: .*obj"),
+        ("a.xyz", b"0 0 0\n1 1 1\n", "no faces .*PointCloud"),
+        ("nowhere.obj", None, r"nowhere\.obj: no such file"),
+        ("", None, "is a folder"),
+    ],
+)
+def test_file_errors(tmp_path, file, data, message):
+    path = tmp_path / file
+    if data is not None:
+        path.write_bytes(data)
+    caught = refused(MeshError, message, load_mesh, path)
+    assert str(caught).startswith(f"{path}: ")
+
+
+def test_source_errors(monkeypatch):
+    beyond = trimesh.Scene([trimesh.Trimesh(np.eye(3), [[0, 1, 3]], process=False), ball()])
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    for source, message in (
+        ("warp:cow", "warp:bunny, warp:bear, warp:rocks"),
+        ("warp:bunny", r"pip install usd-core"),
+        (3, "cannot load a mesh from int"),
+        (trimesh.PointCloud(np.eye(3)), r"no faces .*PointCloud"),
+        (trimesh.Scene(), "no faces"),
+        (beyond, "face 0 has corners"),
+    ):
+        refused(MeshError, message, load_mesh, source)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "v 0 1 2.5\nvn 0 0 1\n# a\nv -1e-3 nan 1_0\nv 1 2 3\nf 1 2 3\n\nf 3 2 1",
+        "v 0 1 2\nv 0  1\nv 1 2 3 4\nf 1 2 3\n",
+        "v 0 1 2 \nv 1 1 1\nv 2 2 2\nf 1 2 3\nf 1 2 3 1\n",
+        "v 0 1 2\nv 1 1 1\nv 2 2 2\nf 1 2 -1\n",
+        "v 0 1 2\nf 1 1 99999999999999999999\n",
+        "v 0 1 2\nf 1/1 1/1 1/1\n",
+        "v 0 1 x\nf 1 1 1\n",
+        "v 0 1 2\nf 0 1 1\n",
+        "f 1 2 3\n",
+        "",
+    ],
+)
+def test_plain_files_are_read_as_any_others(text):
+    """A tab at the end of a file makes it no plain one."""
+
+    def read(data):
+        try:
+            surface = read_obj(data, "here", Remarks())
+            return surface.vertices.tolist(), surface.faces.tolist()
+        except MeshError as error:
+            return str(error)
+
+    assert repr(read(text.encode())) == repr(read(text.encode() + b"\n\t\n"))

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from helpers import samples
+from helpers import refused, samples
 from helpers.samples import REAL_MESHES, of_trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -71,9 +71,6 @@ def soups(draw):
 @pytest.fixture(params=MESHES)
 def mesh(request):
     return mesh_from_arrays(*MESHES[request.param]())
-
-
-# Oracles.
 
 
 def replay(mesh, progressive):
@@ -166,9 +163,6 @@ def check_error(mesh, progressive, steps=8, count=3000):
 def assert_same(a, b, names=FOREST):
     for name in names:
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
-
-
-# Collapse.
 
 
 def test_every_prefix_is_a_mesh(mesh):
@@ -289,12 +283,10 @@ def test_flat_regions_cost_nothing():
 
 def test_bad_input_is_refused():
     mesh = mesh_from_arrays(*MESHES["torus"]())
-    with pytest.raises(ValueError, match="base_faces"):
-        build_progressive(mesh, base_faces=0)
+    refused(ValueError, "base_faces", build_progressive, mesh, base_faces=0)
     progressive = build_progressive(mesh)
     for lod in (-1, progressive.lod_max + 1, 0.5):
-        with pytest.raises(ValueError, match="lod"):
-            progressive.mesh_at(lod)
+        refused(ValueError, "lod", progressive.mesh_at, lod)
 
 
 @pytest.mark.parametrize("name", REAL_MESHES)

@@ -3,7 +3,9 @@
 import hypothesis.strategies as st
 import numpy as np
 import pytest
+from helpers import refused
 from helpers.samples import plain, raw_state, repeated, sample, soup
+from helpers.scenes import scene_with
 from hypothesis import HealthCheck, given, settings
 from oracles import abtree as oracle
 
@@ -11,9 +13,6 @@ import warp_abtree as ab
 from warp_abtree.model.tree import active_build
 
 pytestmark = pytest.mark.usefixtures("half_refitted_in_part")
-
-
-# Build.
 
 
 def without_merges(vertices, faces):
@@ -36,11 +35,7 @@ def test_build_of_soups_equals_the_oracle(count, seed, lattice, scale):
 
 
 def test_build_refuses_no_face():
-    with pytest.raises(ValueError, match="1 to 2"):
-        active_build(np.zeros((3, 3)), np.zeros((0, 3), np.int32))
-
-
-# Update.
+    refused(ValueError, "1 to 2", active_build, np.zeros((3, 3)), np.zeros((0, 3), np.int32))
 
 
 def assert_same_bits(state, other):
@@ -157,14 +152,10 @@ def test_walks_over_soups(device, first, second, walk):
         walker.step(np.round(np.array(step) * walker.tops()).astype(int))
 
 
-# What `tree_state` shows.
-
-
 @pytest.mark.parametrize("name", ["one", "crumbs", "soup", "lattice soup"])
 def test_tree_state_shows_the_state(device, name):
     model = sample(name)
-    scene = ab.Scene(device)
-    scene.add(model, lod=0)
+    scene = scene_with(device, model, lod=0)
     for lod in (0, model.lod_max // 2, model.lod_max):
         scene.set_lods([lod])
         raw, shown = raw_state(scene, 0), scene.tree_state(0)
@@ -188,18 +179,12 @@ def test_tree_state_shows_the_state(device, name):
         assert (shown.lower[1] > used.min(0) - slack).all() and (shown.upper[1] < used.max(0) + slack).all()
 
 
-# Sharing of states.
-
-
 def test_objects_share_states(device):
     model, other = sample("small ball"), sample("crumbs")
-    scene = ab.Scene(device)
-    for m in (model, other, model, model):
-        scene.add(m)
+    scene = scene_with(device, model, other, model, model)
     states, objects = scene.batch().states, scene.batch().objects
     assert objects.state[0] == objects.state[2] == objects.state[3] != objects.state[1]
     assert len(states.slots) == 2
-
     scene.set_lods([10, 5, 20, 30])  # more targets than states: copies
     assert len(set(objects.state)) == 4 and len(states.slots) == 4
     room = states.node_room, states.face_room

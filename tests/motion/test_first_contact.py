@@ -1,22 +1,20 @@
-"""First contacts: never late and hardly early, against dense sampling, other proofs, and fractions."""
+"""First contacts, on screws too: never late and hardly early, against dense sampling, other proofs, and fractions."""
 
 from fractions import Fraction
 
 import numpy as np
 import pytest
-import warp as wp
-from helpers.motions import ANSWERS, STILL, find, random_motions, to_bytes
-from helpers.questions import pairs_of, scene_of
-from helpers.samples import random_poses, random_quaternions, sample
+from helpers import refused
+from helpers.motions import ANSWERS, STILL, find, pose_matrices, random_motions, starts_of, to_bytes
+from helpers.questions import captured, in_a_row, pairs_of, scene_of
+from helpers.samples import grid, random_poses, random_quaternions, sample
+from helpers.scenes import scene_with
 from oracles.motion import apart_until, pose_between, rigid_soups, translation_contact
+from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
 from warp_abtree import testing
 from warp_abtree.kernels.motion import group
-
-
-def starts_of(cases):
-    return np.array([pose for case in cases for pose in (case[2], case[5])])
 
 
 def poses_at(cases, ends, times):
@@ -33,8 +31,7 @@ def meets(scene, cases, ends, times):
 
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-3])
 def test_never_late_and_early_by_the_tolerance(device, tolerance):
-    rng = np.random.default_rng(1)
-    cases, ends = random_motions(rng, 160)
+    cases, ends = random_motions(np.random.default_rng(1), 160)
     scene = scene_of(device, cases)
     result = scene.first_contact(pairs_of(cases), ends, tolerance=tolerance)
     time = result.time
@@ -52,8 +49,7 @@ def test_never_late_and_early_by_the_tolerance(device, tolerance):
 
 def test_agrees_with_steps_of_the_distance(device):
     """A bound of all speeds over brute-force distances proves nothing that the answer does not say too."""
-    rng = np.random.default_rng(2)
-    cases, ends = random_motions(rng, 12, ("box", "three", "one", "crumbs"), 20)
+    cases, ends = random_motions(np.random.default_rng(2), 12, ("box", "three", "one", "crumbs"), 20)
     result = find(device, cases, ends)
     for case, path, time in zip(cases, ends.reshape(-1, 2, 7), result.time, strict=True):
         if time == 0:
@@ -96,12 +92,8 @@ def test_translations_against_fractions(device, far):
 def test_thin_obstacles_are_not_passed(device, name):
     """A bullet through a sheet, however fast and far."""
     rng = np.random.default_rng(4)
-    sheet = ab.Model.from_arrays(
-        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]], [[0, 1, 2], [0, 2, 3]], base_faces=2
-    )
-    bullet = sample(name)
-    scene, ends, far = ab.Scene(device), [], 2.0 ** rng.integers(2, 12, 30)
-    scene.add(sheet)
+    sheet = ab.Model.from_arrays(grid(1)[0] * 2 - [1, 1, 0], grid(1)[1], base_faces=2)
+    bullet, scene, ends, far = sample(name), scene_with(device, sheet), [], 2.0 ** rng.integers(2, 12, 30)
     for way in far:
         scene.add(bullet, (*rng.uniform(-0.1, 0.1, 2), -way, *random_quaternions(rng, 1)[0]))
         ends.append([*rng.uniform(-0.1, 0.1, 2), 3 * way, *random_quaternions(rng, 1)[0]])
@@ -124,18 +116,17 @@ def test_order_of_objects_and_of_pairs_changes_nothing(device):
         np.testing.assert_array_equal(getattr(mixed, name), getattr(first, name)[order])
 
 
-def test_regimes_agree(device):
-    rng = np.random.default_rng(6)
-    cases, ends = random_motions(rng, 40, faces=500)
-    first = to_bytes(find(device, cases, ends))
+@pytest.mark.parametrize("linear", [False, True])
+def test_regimes_agree(device, linear):
+    cases, ends = random_motions(np.random.default_rng(6), 40, faces=500)
+    first = to_bytes(find(device, cases, ends, linear=linear))
     for warps, length in ((True, None), (True, 129), (None, 200)):
         with testing.regime(warps=warps, stack_length=length, cpu_threads=1 if length else 2):
-            assert to_bytes(find(device, cases, ends)) == first
+            assert to_bytes(find(device, cases, ends, linear=linear)) == first
 
 
 def test_warps_that_take_a_group_of_pairs_agree(device):
-    rng = np.random.default_rng(8)
-    cases, ends = random_motions(rng, 65, faces=30)
+    cases, ends = random_motions(np.random.default_rng(8), 65, faces=30)
     pairs = np.array([(i, j) for j in range(len(ends)) for i in range(j)])
     assert len(pairs) > int(group.GROUPED_LEAST) and len(pairs) % int(group.GROUP)
     found = []
@@ -149,8 +140,7 @@ def test_warps_that_take_a_group_of_pairs_agree(device):
 
 @pytest.mark.parametrize("exponent", [-40, 40])
 def test_scaling_by_a_power_of_two_changes_nothing(device, exponent):
-    rng = np.random.default_rng(7)
-    cases, ends = random_motions(rng, 24)
+    cases, ends = random_motions(np.random.default_rng(7), 24)
     first = find(device, cases, ends)
     factor, scaled = 2.0**exponent, []
     for model_a, lod_a, pose_a, model_b, lod_b, pose_b in cases:
@@ -169,13 +159,11 @@ def test_screws_end_where_they_should_and_keep_their_distance_from_the_axis(devi
     """A ball on a screw about z, beside a post there: touches if and only if it is as near as that."""
     post, ball = sample("one"), sample("small ball")
     reach = np.linalg.norm(ball.mesh_at(ball.lod_max)[0], axis=1).max()
-    scene, ends = ab.Scene(device), [STILL]
     vertices = post.mesh_at(post.lod_max)[0]
     middle = vertices.mean(0)
-    scene.add(post, (*-middle, 0, 0, 0, 1))
     radius = np.linalg.norm(vertices - middle, axis=1).max() + 1.05 * reach
     half = np.deg2rad(80)
-    scene.add(ball, (radius, 0, -0.1, 0, 0, 0, 1))
+    scene = scene_with(device, (post, (*-middle, 0, 0, 0, 1)), (ball, (radius, 0, -0.1, 0, 0, 0, 1)))
     ends = [
         [*-middle, 0, 0, 0, 1],
         [radius * np.cos(2 * half), radius * np.sin(2 * half), 0.1, 0, 0, np.sin(half), np.cos(half)],
@@ -185,8 +173,7 @@ def test_screws_end_where_they_should_and_keep_their_distance_from_the_axis(devi
 
 
 def test_resting_and_parting_objects_are_clear(device):
-    rng = np.random.default_rng(8)
-    cases, _ = random_motions(rng, 30)
+    cases, _ = random_motions(np.random.default_rng(8), 30)
     scene, starts = scene_of(device, cases), starts_of(cases)
     met = scene.intersect(pairs_of(cases)).any
     rest = scene.first_contact(pairs_of(cases), starts)
@@ -201,16 +188,9 @@ def test_common_motions_are_clear(device):
     whole = random_poses(rng, 20, 5.0)
     scene = scene_of(device, cases)
     met = scene.intersect(pairs_of(cases)).any
-
-    def matrices(poses):
-        turns = np.array([wp.quat_to_matrix(wp.quat(*q)) for q in poses[:, 3:]]).reshape(-1, 3, 3)
-        made = np.tile(np.eye(4), (len(poses), 1, 1))
-        made[:, :3, :3], made[:, :3, 3] = turns, poses[:, :3]
-        return made
-
-    starts = matrices(starts_of(cases))
+    starts = pose_matrices(starts_of(cases))
     scene.set_poses(starts)
-    ends = np.repeat(matrices(whole), 2, 0) @ starts
+    ends = np.repeat(pose_matrices(whole), 2, 0) @ starts
     result = scene.first_contact(pairs_of(cases), ends, screw=True)
     near = scene.intersect(pairs_of(cases), "distance").distance < 1e-3
     np.testing.assert_array_equal(result.clear[~near], ~met[~near])
@@ -248,31 +228,26 @@ def test_calls_that_repeat_take_other_options(device):
 
 
 def test_captured_graphs(device):
-    rng = np.random.default_rng(10)
-    cases, ends = random_motions(rng, 20)
+    cases, ends = random_motions(np.random.default_rng(10), 20)
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     query = ab.FirstContactQuery(scene, ends, pairs)
     first = query.run()
-    with wp.ScopedCapture(query.device) as capture:
-        query.launch()
+    replay = captured(query)
     query.set_end_poses(starts_of(cases))
-    wp.capture_launch(capture.graph)
+    replay()
     assert query.result().clear[first.time > 0].all()
     query.set_end_poses(ends)
-    wp.capture_launch(capture.graph)
+    replay()
     assert to_bytes(query.result()) == to_bytes(first)
     on_device = query.result(device=True)
     assert [getattr(on_device, name).numpy().tobytes() for name in ANSWERS] == to_bytes(first)
 
 
 def test_bad_input(device):
-    scene = ab.Scene(device)
-    for x in (0, 3):
-        scene.add(sample("box"), (x, 0, 0, 0, 0, 0, 1))
+    scene = in_a_row(device, "box", (0, 3))
     ends = np.array([STILL, STILL])
     for tolerance in (0, 1, -1, np.nan, "a", 2.0**-41, [1e-6]):
-        with pytest.raises(ValueError, match="tolerance"):
-            scene.first_contact([(0, 1)], ends, tolerance=tolerance)
+        refused(ValueError, "tolerance", scene.first_contact, [(0, 1)], ends, tolerance=tolerance)
     for bad, message in (
         (ends[:1], "1 given for 2"),
         (ends[0], "shape"),
@@ -281,10 +256,8 @@ def test_bad_input(device):
         (np.array([STILL, [0, 0, 0, 0, 0, 1, 0]]), "half a revolution"),
         (np.array([STILL, [0, 0, 0, 0, 1, 0, 1e-8]]), "half a revolution"),
     ):
-        with pytest.raises(ValueError, match=message):
-            scene.first_contact([(0, 1)], bad)
-    with pytest.raises(ValueError):
-        scene.first_contact([(0, 2)], ends)
+        refused(ValueError, message, scene.first_contact, [(0, 1)], bad)
+    refused(ValueError, None, scene.first_contact, [(0, 2)], ends)
     assert scene.first_contact([(0, 1)], np.array([STILL, [3, 0, 0, 0, 0, 1, 1e-5]])).clear.all()
     assert len(scene.first_contact(np.empty((0, 2), int), ends).time) == 0
 
@@ -297,10 +270,7 @@ def test_sweeps(device, path):
     starts, ends = (random_poses(rng, 1500, 3.0) for _ in range(2))
     options = {"output": "first_contact", "tolerance": 1e-3, "lod_a": a.lod_for(fraction=0.1), "device": device, **path}
     rows = ab.sweep(a, b, starts, end_poses=ends, **options)
-    scene = ab.Scene(device)
-    scene.add(a, lod=options["lod_a"])
-    for pose in starts[:100]:
-        scene.add(b, pose)
+    scene = scene_with(device, (a, STILL, {"lod": options["lod_a"]}), *[(b, pose) for pose in starts[:100]])
     pairs = np.stack([np.zeros(100, int), np.arange(1, 101)], 1)
     result = scene.first_contact(pairs, [STILL, *ends[:100]], tolerance=1e-3, **path)
     for name in ANSWERS:
@@ -312,8 +282,7 @@ def test_sweeps(device, path):
         ({"end_poses": ends, "beyond": 1.0}, TypeError, "beyond"),
         ({"end_poses": ends, "tolerance": 2}, ValueError, "tolerance"),
     ):
-        with pytest.raises(error, match=message):
-            ab.sweep(a, b, starts, **{**options, **bad})
+        refused(error, message, ab.sweep, a, b, starts, **{**options, **bad})
     assert len(ab.sweep(a, b, np.empty((0, 7)), end_poses=np.empty((0, 7)), **options)) == 0
 
 
@@ -341,3 +310,51 @@ def test_margins_cover_the_rounding_of_boxes(device):
     result = find(device, cases, np.array(ends))
     late = [float(Fraction(time) - truth) for time, truth in zip(result.time.tolist(), truths)]
     assert -1e-6 <= min(late) and max(late) <= 0 and not result.undecided.any()
+
+
+COUNT, TIMES = 80, 41
+
+
+def random_patch(rng, pitch):
+    """Return the model of a flat patch of 4 faces some 1 from the z axis, tilted, wide or small; some along a screw."""
+    width = rng.choice([0.05, 0.35], 2) * rng.uniform(0.5, 1, 2)
+    u, v = (np.stack(np.meshgrid([-1, 0, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 2) * width).T
+    tilt = Rotation.from_rotvec([0, rng.uniform(-1, 1), rng.uniform(-0.3, 0.3)])
+    if rng.random() < 0.5:
+        tilt = Rotation.from_rotvec([np.arctan(pitch), 0, 0]) * Rotation.from_rotvec([0, rng.uniform(0.8, 1.7), 0])
+    place = [rng.uniform(0.95, 1.05), 0, rng.uniform(-0.05, 0.05) * rng.choice([0.1, 1])]
+    points = tilt.apply(np.stack([0 * u, u, v], 1)) + place
+    return ab.Model.from_arrays(points, [[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]], base_faces=4)
+
+
+def pose_on_screw(whole, turn, offset):
+    """Return a pose turned about the z axis of a frame, and moved in it."""
+    frame = Rotation.from_quat(whole[3:])
+    return np.concatenate([frame.apply(offset) + whole[:3], (frame * Rotation.from_euler("z", turn)).as_quat()])
+
+
+def sliding_motions(rng, drift):
+    """Return cases of patches, one of which turns by up to 170 degrees about z and moves along it, and end poses."""
+    cases, ends = [], []
+    for k in range(COUNT):
+        turn, rise, met = np.deg2rad(rng.uniform(5, 170)), rng.normal(), rng.uniform(-0.1, 1.1)
+        models, whole = [random_patch(rng, rise / turn) for _ in range(2)], random_poses(rng, 1, 1.0)[0]
+        moves = [pose_on_screw(whole, (t - met) * turn, [t * drift, 0, (t - met) * rise]) for t in (0, 1)]
+        first, second = ((whole, whole), moves) if k % 2 else (moves, (whole, whole))
+        cases.append([models[0], models[0].lod_max, first[0], models[1], models[1].lod_max, second[0]])
+        ends += [first[1], second[1]]
+    return cases, np.array(ends)
+
+
+@pytest.mark.parametrize(("drift", "seed"), [(0.0, 1), (0.03, 2)])
+def test_patches_on_a_screw_are_never_late(device, drift, seed):
+    """Also where they drift across the axis."""
+    cases, ends = sliding_motions(np.random.default_rng(seed), drift)
+    result = find(device, cases, ends)
+    scene, pairs = scene_of(device, cases), pairs_of(cases)
+    starts = starts_of(cases)
+    assert not result.undecided.any() and 10 < result.clear.sum() < COUNT - 10
+    for part in np.linspace(0, 1, TIMES):
+        times = np.repeat(part * result.time, 2)
+        scene.set_poses(np.array([pose_between(*row) for row in zip(starts, ends, times)]))
+        assert not scene.intersect(pairs).any[result.time > 0].any(), part

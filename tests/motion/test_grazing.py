@@ -1,20 +1,25 @@
-"""Corners that move straight and come as near as it gets, or just touch: what float64 cannot tell, in fractions."""
+"""Linear CCD: corners that graze against fractions, whole meshes, and public queries with ground truth."""
 
 import itertools
 
 import numpy as np
 import pytest
 import trimesh
+from helpers import refused
+from helpers.motions import STILL, find, random_motions
+from helpers.questions import in_a_row
+from helpers.scenes import scene_with
+from oracles.motion import apart_until, straight_soups
 from oracles.straight import Motion
-from oracles.triangle import triangles_intersect
+from oracles.triangle import box_pairs, pairs_intersect, triangles_intersect
 
 import warp_abtree as ab
-from bench.motions.ccd_queries import CORNERS
+from bench.motions.ccd_queries import CORNERS, FOLDER, read_queries
 from warp_abtree import testing
 
 KINDS = ("vertex-face", "edge-edge")
 FACE = [(0, 0, 0), (4, 0, 0), (0, 4, 0)]
-ACROSS = [(0, 0, 0), (4, 0, 0), (2, -2, 0), (2, 2, 0)]
+ACROSS, LINE = [(0, 0, 0), (4, 0, 0), (2, -2, 0), (2, 2, 0)], [(0, 0, 0), (1, 0, 0), (3, 0, 0), (4, 0, 0)]
 
 
 def moved(points, *ways):
@@ -23,35 +28,22 @@ def moved(points, *ways):
     return points, [tuple(np.add(p, w)) for p, w in zip(points, ways)]
 
 
+VERTEX, EDGES = KINDS
+ROD = [(0, 0, 1), (2, 0, 1)]
+# Features, their corners and ways, and whether they meet.
 KNOWN = {
-    "through a face": ("vertex-face", moved([(1, 1, 1), *FACE], (0, 0, -2), (0, 0, 0)), True),
-    "beside it": ("vertex-face", moved([(3, 3, 1), *FACE], (0, 0, -2), (0, 0, 0)), False),
-    "onto it at last": ("vertex-face", moved([(1, 1, 1), *FACE], (0, 0, -1), (0, 0, 0)), True),
-    "not quite": ("vertex-face", moved([(1, 1, 1), *FACE], (0, 0, -0.99), (0, 0, 0)), False),
-    "in its plane, past a corner": ("vertex-face", moved([(-2, -1, 0), *FACE], (4, -2, 0), (0, 0, 0)), False),
-    "in its plane, over a corner": ("vertex-face", moved([(-1, 1, 0), *FACE], (2, -2, 0), (0, 0, 0)), True),
-    "onto a face that becomes a line": (
-        "vertex-face",
-        moved([(1, 1, 0), *FACE], (0, 0, 0), (0, 0, 0), (0, 0, 0), (4, -4, 0)),
-        True,
-    ),
-    "one edge over the other": ("edge-edge", moved([*ACROSS[:2], (2, -2, 1), (2, 2, 1)], (0, 0, 2), (0, 0, 0)), True),
-    "along the other's line": ("edge-edge", moved([(0, 0, 0), (1, 0, 0), (3, 0, 0), (4, 0, 0)], (1, 0, 0)), False),
-    "onto its end": (
-        "edge-edge",
-        moved([(0, 0, 0), (1, 0, 0), (3, 0, 0), (4, 0, 0)], (2, 0, 0), (2, 0, 0), (0, 0, 0)),
-        True,
-    ),
-    "parallel, over": (
-        "edge-edge",
-        moved([(0, 0, 1), (2, 0, 1), (1, 0, 0), (4, 0, 0)], (0, 0, -2), (0, 0, -2), (0, 0, 0)),
-        True,
-    ),
-    "parallel, past the end": (
-        "edge-edge",
-        moved([(0, 0, 1), (2, 0, 1), (3, 0, 0), (4, 0, 0)], (0, 0, -2), (0, 0, -2), (0, 0, 0)),
-        False,
-    ),
+    "through a face": (VERTEX, moved([(1, 1, 1), *FACE], (0, 0, -2), (0, 0, 0)), True),
+    "beside it": (VERTEX, moved([(3, 3, 1), *FACE], (0, 0, -2), (0, 0, 0)), False),
+    "onto it at last": (VERTEX, moved([(1, 1, 1), *FACE], (0, 0, -1), (0, 0, 0)), True),
+    "not quite": (VERTEX, moved([(1, 1, 1), *FACE], (0, 0, -0.99), (0, 0, 0)), False),
+    "in its plane, past a corner": (VERTEX, moved([(-2, -1, 0), *FACE], (4, -2, 0), (0, 0, 0)), False),
+    "in its plane, over a corner": (VERTEX, moved([(-1, 1, 0), *FACE], (2, -2, 0), (0, 0, 0)), True),
+    "onto a face that becomes a line": (VERTEX, moved([(1, 1, 0), *FACE], *[(0, 0, 0)] * 3, (4, -4, 0)), True),
+    "one edge over the other": (EDGES, moved([*ACROSS[:2], (2, -2, 1), (2, 2, 1)], (0, 0, 2), (0, 0, 0)), True),
+    "along the other's line": (EDGES, moved(LINE, (1, 0, 0)), False),
+    "onto its end": (EDGES, moved(LINE, (2, 0, 0), (2, 0, 0), (0, 0, 0)), True),
+    "parallel, over": (EDGES, moved([*ROD, (1, 0, 0), (4, 0, 0)], *[(0, 0, -2)] * 2, (0, 0, 0)), True),
+    "parallel, past the end": (EDGES, moved([*ROD, *LINE[2:]], *[(0, 0, -2)] * 2, (0, 0, 0)), False),
 }
 
 
@@ -166,11 +158,64 @@ def test_posed_meshes_come_as_near(gap, clear, way, device):
     first = np.array([0, 0, 1.0 if way == "comes down" else gap])
     last = np.array([0.375, 0.5, gap])
     for turn, end_turn, axes in (((0, 0, 0, 1), (0, 0, 0.6, 0.8), [0, 1, 2]), ((0.5,) * 4, (0.5,) * 4, [2, 0, 1])):
-        scene = ab.Scene(device)
-        scene.add(base, (0, 0, 0, *turn))
-        scene.add(top, (*first[axes], *turn))
+        scene = scene_with(device, (base, (0, 0, 0, *turn)), (top, (*first[axes], *turn)))
         ends = np.array([(0, 0, 0, *turn), (*last[axes], *end_turn)])
         result = scene.first_contact([(0, 1)], ends, linear=True)
         assert result.clear[0] == clear and not result.undecided[0]
         if not clear:
             assert 1 - 1e-6 <= result.time[0] <= 1 if way == "comes down" else result.time[0] == 0
+
+
+TOLERANCE = 1e-6
+
+
+def soups_intersect(a, b):
+    """Return whether corners (f, 3, 3) have a point in common, in integers."""
+    pairs = box_pairs(a, b)
+    corners = [np.arange(3 * len(soup)).reshape(-1, 3) for soup in (a, b)]
+    return pairs_intersect(a.reshape(-1, 3), corners[0], b.reshape(-1, 3), corners[1], pairs).any()
+
+
+def test_never_late_and_early_by_the_tolerance(device):
+    cases, ends = random_motions(np.random.default_rng(1), 40, ("box", "small ball", "torus", "soup"), 40, 1.5)
+    result = find(device, cases, ends, linear=True)
+    assert not result.undecided.any() and 10 < result.clear.sum() < 35 and (result.time == 0).sum() < 10
+    for case, path, time, clear in zip(cases, ends.reshape(-1, 2, 7), result.time, result.clear, strict=True):
+        meshes = [model.mesh_at(lod)[:2] for model, lod in (case[:2], case[3:5])]
+        place, speed = straight_soups(meshes, (case[2], case[5]), path)
+        if time > 0:
+            assert apart_until(place, speed, 1e-3) <= time + TOLERANCE
+            for part in (0.0, 0.3, 0.6, 0.8, 0.9, 0.97, 0.999, 1.0):
+                assert not soups_intersect(*place(part * time))
+        if not clear:
+            assert soups_intersect(*place(min(time + TOLERANCE, 1.0) if time > 0 else 0.0))
+
+
+def test_without_turns_it_is_the_rigid_motion(device):
+    cases, ends = random_motions(np.random.default_rng(3), 30)
+    for case, path in zip(cases, ends.reshape(-1, 2, 7)):
+        path[:, 3:] = case[2][3:], case[5][3:]
+    rigid, straight = (find(device, cases, ends, linear=linear) for linear in (False, True))
+    np.testing.assert_array_equal(rigid.clear, straight.clear)
+    np.testing.assert_allclose(rigid.time, straight.time, rtol=0, atol=TOLERANCE)
+
+
+def test_half_revolutions_have_straight_ways(device):
+    scene = in_a_row(device, "box", (0, 8))
+    ends = [STILL, [8, 0, 0, 0, 0, 1, 0]]
+    assert scene.first_contact([(0, 1)], ends, linear=True).clear.all()
+    refused(ValueError, "one kind of path", scene.first_contact, [(0, 1)], ends, linear=True, screw=True)
+
+
+def test_public_queries_are_told_from_contacts(device):
+    """Ground truth in rational numbers; one of them comes within 2^-105 of its size."""
+    files = sorted(FOLDER.glob("*.csv.gz"))
+    if not files:
+        pytest.skip("queries of continuous collision detection are not at hand; ABTREE_CCD names their folder")
+    beyond = 0
+    for path in files:
+        starts, ends, truth = read_queries(path)
+        _, clear, undecided = testing.advance_corners(starts, ends, TOLERANCE, device)
+        assert not clear[truth].any() and not undecided.any()
+        beyond += (~truth & ~clear).sum()
+    assert beyond <= 1

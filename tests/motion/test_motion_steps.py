@@ -1,5 +1,6 @@
-"""Bounds of the steps in time of `kernels.motion`, each by itself, in fractions: no step is too long, nor any sum."""
+"""Steps in time and turns of `kernels.motion`, each by itself: in fractions no step is too long, nor any sum."""
 
+import math
 from fractions import Fraction
 
 import numpy as np
@@ -7,13 +8,16 @@ import pytest
 import warp as wp
 from helpers.motions import STILL, find
 from helpers.questions import launch, pairs_of, scene_of
+from helpers.samples import random_quaternions
 from oracles.motion import translation_contact
+from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree.kernels.motion.face_pair import bend_of_face, safe_step, step_along, time_after
 from warp_abtree.kernels.motion.linear import straight_step
 from warp_abtree.kernels.motion.node_pair import later, step_of
 from warp_abtree.kernels.motion.path import Moment, Motion
+from warp_abtree.kernels.motion.turn import shortest_turn, sin_cos_half, turn_matrix
 from warp_abtree.kernels.triangle.distance import corners_type
 
 COUNT = 1000
@@ -166,3 +170,43 @@ def contact_in_fractions(corners, still, start, end):
     places = [[Fraction(x) for x in place.tolist()] for place in (still, start, end)]
     posed = [np.array(soup) + np.array(place) for soup, place in zip(exact, places)]
     return translation_contact(posed[0], posed[1], np.array(places[2]) - np.array(places[1]))
+
+
+@wp.kernel(module="unique", module_options={"fuse_fp": False})
+def halves_kernel(angle: wp.array(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)):
+    i = wp.tid()
+    s, c = sin_cos_half(angle[i])
+    out[i, 0] = s
+    out[i, 1] = c
+
+
+@wp.kernel(module="unique", module_options={"fuse_fp": False})
+def turn_kernel(turn: wp.array(dtype=wp.mat33d), out: wp.array2d(dtype=wp.float64)):
+    i = wp.tid()
+    axis, angle, _ = shortest_turn(turn[i])
+    back = turn_matrix(axis, angle)
+    out[i, 0] = angle
+    for j in range(9):
+        out[i, 1 + j] = back[j / 3, j % 3]
+
+
+def test_sines_are_those_of_float64(device):
+    angles = np.linspace(0, math.pi, 20001)
+    found = launch(halves_kernel, device, len(angles), angles, columns=2)
+    truth = np.array([[math.sin(0.5 * x), math.cos(0.5 * x)] for x in angles])
+    assert np.abs(found - truth).max() <= 4 * 2.0**-53
+
+
+@pytest.mark.parametrize("angle", [3.14159, 3.0, 1.0, 1e-3, 1e-9, 1e-15, 0.0])
+def test_turns_are_found_again(device, angle):
+    axes = np.random.default_rng(1).normal(size=(200, 3))
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    turns = np.array([quaternion_matrix([*(math.sin(angle / 2) * axis), math.cos(angle / 2)]) for axis in axes])
+    found = launch(turn_kernel, device, len(turns), turns, columns=10)
+    assert np.abs(found[:, 0] - angle).max() <= 40 * 2.0**-53
+    assert np.abs(found[:, 1:].reshape(-1, 3, 3) - turns).max() <= 40 * 2.0**-53
+
+
+def test_half_revolutions_are_none(device):
+    turns = np.array([quaternion_matrix([*q[:3], 0]) for q in random_quaternions(np.random.default_rng(2), 50)])
+    assert (launch(turn_kernel, device, len(turns), turns, columns=10)[:, 0] == -1).all()

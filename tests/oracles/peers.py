@@ -4,18 +4,25 @@ import numpy as np
 
 from oracles.triangle import into_frame_of_a, pairs_intersect, pose_matrix
 
+STILL = (0, 0, 0, 0, 0, 0, 1)
+
+
+def fcl_object(vertices, faces, pose=STILL):
+    """Return a mesh as FCL has it, at a pose."""
+    import fcl
+
+    model = fcl.BVHModel()
+    model.beginModel(len(vertices), len(faces))
+    model.addSubModel(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32))
+    model.endModel()
+    return fcl.CollisionObject(model, fcl.Transform(*pose_matrix(pose)))
+
 
 def fcl_faces(vertices_a, faces_a, vertices_b, faces_b, pose_a, pose_b):
     """Set of intersecting (face of A, face of B) after FCL."""
     import fcl
 
-    objects = []
-    for vertices, faces, pose in ((vertices_a, faces_a, pose_a), (vertices_b, faces_b, pose_b)):
-        model = fcl.BVHModel()
-        model.beginModel(len(vertices), len(faces))
-        model.addSubModel(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32))
-        model.endModel()
-        objects.append(fcl.CollisionObject(model, fcl.Transform(*pose_matrix(pose))))
+    objects = fcl_object(vertices_a, faces_a, pose_a), fcl_object(vertices_b, faces_b, pose_b)
     request = fcl.CollisionRequest(num_max_contacts=2**31 - 1, enable_contact=True)
     result = fcl.CollisionResult()
     fcl.collide(*objects, request, result)

@@ -52,11 +52,15 @@ def into_frame_of_a(points_b, pose_a, pose_b):
     return transform(*relative_pose(*pose_matrix(pose_a), *pose_matrix(pose_b)), points_b)
 
 
+def lowest_exponent(*arrays):
+    """Exponent of the power of two that `integer_points` counts in."""
+    parts = [np.frexp(np.asarray(a, np.float64)) for a in arrays]
+    return min((int(e[m != 0].min()) for m, e in parts if m.any()), default=53) - 53
+
+
 def integer_points(*arrays):
     """Each (n, 3) float64 array as a list of integer triples, all on one common power of two."""
-    parts = [np.frexp(np.asarray(a, np.float64)) for a in arrays]
-    exponents = [e[m != 0] for m, e in parts]
-    lowest = min((int(e.min()) for e in exponents if e.size), default=0)
+    parts, lowest = [np.frexp(np.asarray(a, np.float64)) for a in arrays], lowest_exponent(*arrays) + 53
     result = []
     for mantissa, exponent in parts:
         integer, shift = (mantissa * 2.0**53).astype(np.int64), np.where(mantissa != 0, exponent - lowest, 0)

@@ -1,7 +1,7 @@
-"""The least distance of two triangles that do not cross, in integers: nothing is rounded but the end.
+"""The distance of two triangles in integers, or minus the shortest motion that parts them: the end alone is rounded.
 
-Apart from the kernels also in how: corners, feet of corners on edges and on faces, and common normals of edges, each
-by itself and only where it lies inside.
+The depth is that of the origin in the hull of all differences of corners, found from the planes of all triples of them
+that have no difference on one side: apart from the kernels also in that no edge or normal of a face is used.
 """
 
 import itertools
@@ -9,27 +9,45 @@ import math
 
 import numpy as np
 
-
-def to_integers(corners):
-    """Return float64 numbers as integers on a common exponent, and the exponent."""
-    fraction, exponent = np.frexp(corners)
-    used = corners != 0
-    least = int(exponent[used].min()) - 53 if used.any() else 0
-    mantissa = np.ldexp(fraction, 53).astype(np.int64)
-    flat = [int(m) << max(int(e) - 53 - least, 0) if m else 0 for m, e in zip(mantissa.flat, exponent.flat)]
-    return np.array(flat, object).reshape(corners.shape), least
+from oracles.triangle import box_pairs, cross, dot, integer_points, lowest_exponent, triangles_intersect
+from oracles.triangle import sub as minus
 
 
-def dot(u, v):
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+def crossing_depth(a, b):
+    """Return the shortest motion that parts two triangles which intersect, to the rounding of a division and a root."""
+    (a, b), exponent = integer_points(a, b), lowest_exponent(a, b)
+    differences = [minus(p, q) for p, q in itertools.product(a, b)]
+    least = None
+    for x, y, z in itertools.combinations(differences, 3):
+        n = cross(minus(y, x), minus(z, x))
+        if not any(n):
+            continue
+        sides = [dot(n, minus(p, x)) for p in differences]
+        if min(sides) >= 0 or max(sides) <= 0:
+            square = dot(n, x) ** 2 / dot(n, n)
+            least = square if least is None else min(least, square)
+    return math.ldexp(math.sqrt(least or 0), exponent)
 
 
-def cross(u, v):
-    return (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
+def separation(a, b):
+    """Return the separation of triangles float64 (3, 3) each, and whether they intersect, which is exact."""
+    if triangles_intersect(a, b):
+        return -crossing_depth(a, b), True
+    return triangle_distance(a, b), False
 
 
-def minus(u, v):
-    return (u[0] - v[0], u[1] - v[1], u[2] - v[2])
+def near_faces(a, b, gap):
+    """Return (face of A, face of B), separations and which intersect, of faces (n, 3, 3) within a gap or a bit more."""
+    wide = 1.01 * gap + 1e-9
+    pairs = box_pairs(np.concatenate([a, a.min(1, keepdims=True) - wide, a.max(1, keepdims=True) + wide], 1), b)
+    found = [separation(a[i], b[j]) for i, j in pairs]
+    rows = [(pair, s, met) for pair, (s, met) in zip(pairs, found) if met or s <= wide]
+    order = sorted(rows, key=lambda row: tuple(row[0]))
+    return (
+        np.array([row[0] for row in order], np.int64).reshape(-1, 2),
+        np.array([row[1] for row in order]),
+        np.array([row[2] for row in order], bool),
+    )
 
 
 def over_edges(w, e):
@@ -58,8 +76,7 @@ def over_face(p, a, b, c):
 
 def triangle_distance(a, b):
     """Return the distance of triangles float64 (3, 3) each, to the rounding of one division and one root."""
-    corners, exponent = to_integers(np.stack([a, b]))
-    a, b = [[tuple(corner) for corner in triangle] for triangle in corners.tolist()]
+    (a, b), exponent = integer_points(a, b), lowest_exponent(a, b)
     found = []
     for i, j in itertools.product(range(3), repeat=2):
         r = minus(b[j], a[i])

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import warp as wp
+from helpers import refused
 from helpers.faults import describe
 from helpers.questions import to_matrix
 from helpers.samples import STILL, random_poses, sample
-from helpers.scenes import add_objects
+from helpers.scenes import add_objects, scene_with
 from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
@@ -93,9 +94,7 @@ def test_poses(device, framework, shape, real, monkeypatch):
         expected = getattr(first.batch().objects.pool, name).numpy()
         assert getattr(second.batch().objects.pool, name).numpy().tobytes() == expected.tobytes()
     model, many = sample("torus"), poses_of(shape, real, 500)
-    scene = ab.Scene(device)
-    for pose in (STILL, *many):
-        scene.add(model, pose)
+    scene = scene_with(device, *[(model, pose) for pose in (STILL, *many)])
     expected = scene.intersect([(0, i + 1) for i in range(500)], output="faces")
     assert expected.any.any()
     for output in ("count", "faces"):
@@ -148,8 +147,7 @@ def test_what_lies_elsewhere_is_refused_or_copied(device, framework):
         (scene.intersect, np.array([(0, 7)]), "has 4 objects"),
         (lambda given: ab.sweep(torus, torus, given, device=device), bad, "pose 2 has a quaternion"),
     ):
-        with pytest.raises(ValueError, match=what):
-            call(framework(values))
+        refused(ValueError, what, call, framework(values))
         np.testing.assert_array_equal(scene.batch().objects.pool.position.numpy(), before)
 
 
@@ -168,8 +166,7 @@ def test_what_is_wrong_with_a_matrix_is_told(device, framework):
         (np.diag([1, -1, 1, 1.0]) * np.ones((4, 1, 1)), "matrix 0 .*it mirrors"),
         (np.diag([2, 2, 2, 1.0]) * np.ones((4, 1, 1)), "matrix 0 .*off the identity by 3; a scale"),
     ):
-        with pytest.raises(ValueError, match=why):
-            scene.set_poses(framework(values))
+        refused(ValueError, why, scene.set_poses, framework(values))
     u, _, v = np.linalg.svd(drifted)
     poses[1, :3, :3] = u @ v
     scene.set_poses(framework(poses))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.questions import sort_rows, to_matrix
 from helpers.samples import STILL, random_poses, raw_state, sample
+from helpers.scenes import scene_with
 from hypothesis import HealthCheck, given, settings
 from oracles.triangle import pose_matrix
 
@@ -206,9 +207,7 @@ def test_frames_off_orthonormal_hide_no_pair(device, order):
     meets = []
     for gap in (-9.5e-7, 0.0, 4.0e-7, 4.9e-7, 9e-7):
         # The boxes' faces lie half a unit from their middles; only the first frame is off.
-        scene = ab.Scene(device)
-        scene.add(model, shrunk)
-        scene.add(model, (order * (1 + gap / 2), 0, 0, 0, 0, 0, 1))
+        scene = scene_with(device, (model, shrunk), (model, (order * (1 + gap / 2), 0, 0, 0, 0, 0, 1)))
         meets.append(scene.intersect([(0, 1)]).any[0])
         assert len(scene.broad_phase()) or not meets[-1]
         assert scene.intersect().any.any() == meets[-1]

@@ -1,13 +1,16 @@
 """Batched traversal: every intersecting face pair, against exact brute force and an independent library."""
 
 import copy
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import warp as wp
-from conftest import slow
+from conftest import ROOT, slow
 from helpers.questions import GpuQuery, ask, in_a_row, launch, pairs_of, random_case, scene_of, sort_rows
 from helpers.samples import REAL_MESHES, STILL, WARP_MESHES, contact_poses, random_poses, sample, true_faces
+from helpers.scenes import scene_with
 from oracles.peers import fcl_faces, judge
 from oracles.triangle import into_frame_of_a
 
@@ -79,9 +82,7 @@ def test_relative_poses_equal_the_definition(device):
     points = rng.normal(size=(50, 3)) * 2.0 ** rng.integers(-30, 5, (50, 3))
     points[:2] = (0, 0, 0), (2.0**-291, -(2.0**-300), 2.0**-290)
     poses[:2] = STILL
-    scene = ab.Scene(device)
-    for pose in poses:
-        scene.add(sample("box"), pose)
+    scene = scene_with(device, *[(sample("box"), pose) for pose in poses])
     pairs = np.concatenate([np.arange(60).reshape(-1, 2), rng.permutation(60).reshape(-1, 2)])
     query = ab.Query(scene, "any", pairs=pairs, precision="exact")
     query.launch()
@@ -215,9 +216,7 @@ def test_small_and_large_trees_by_turns(device):
 def test_coincident_meshes_go_to_float64_at_once(device):
     """Of twins in one place all faces, of a copy's those that float32 leaves open: the answers are the same."""
     model, pose = sample("soup"), random_poses(np.random.default_rng(12), 1, 1.0)[0]
-    scene = ab.Scene(device)
-    for placed in (model, model, copy.copy(model)):
-        scene.add(placed, pose)
+    scene = scene_with(device, *[(placed, pose) for placed in (model, model, copy.copy(model))])
     result = scene.intersect([(0, 1), (0, 2)], "faces")
     first, second = (result.faces[result.faces[:, 0] == p, 1:] for p in range(2))
     np.testing.assert_array_equal(first, second)
@@ -242,3 +241,34 @@ def test_a_coarse_tree_costs_no_more_than_one_built_for_its_lod(device, name, fr
         theirs = ask(device, [(static, None, pose_a, static, None, pose_b) for pose_a, pose_b in poses], output="count")
     np.testing.assert_array_equal(ours.count, theirs.count)
     assert ours.node_tests.sum() <= 1.1 * theirs.node_tests.sum()
+
+
+POISONED = """
+import numpy as np
+import trimesh
+import warp as wp
+
+import warp_abtree as ab
+
+ball = trimesh.creation.icosphere(2)
+scene = ab.Scene("cpu")
+scene.add(ab.Model.from_arrays(ball.vertices, ball.faces))
+scene.add(ab.Model.from_arrays(np.array([[-99.0, -99, 0], [99, -99, 0], [0, 99, 0]]), [[0, 1, 2]]))
+states = scene.batch().states.pool
+nodes = states.node_box.numpy()
+poison = np.full((4096, 4), 2**29 + 12345, np.int32).view(np.float32)
+states.node_box = wp.array(np.concatenate([nodes, poison]), dtype=wp.vec4, device="cpu")
+query = ab.Query(scene, "faces", pairs=[(0, 1)])
+poses = np.tile(np.eye(4), (2, 1, 1))
+for z in np.linspace(-0.9, 0.9, 40):
+    poses[0, :3, 3] = z / 3, 0, z
+    scene.set_poses(poses)
+    assert query.run().any.all()
+"""
+
+
+@pytest.mark.slow
+def test_nothing_beyond_the_nodes_is_read():
+    """Beyond them lie records that lead far out of memory: a process of its own ends where it reads there."""
+    done = subprocess.run([sys.executable, "-c", POISONED], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr

@@ -4,25 +4,15 @@ import itertools
 
 import numpy as np
 import pytest
-import warp as wp
-from helpers.questions import in_a_row, pairs_of, random_case, random_lod, scene_of
-from helpers.samples import SHAPES, STILL, contact_poses, sample
+from helpers import refused
+from helpers.questions import captured, far_cases, in_a_row, pairs_of, parted_cases, scale_cases, scene_of
+from helpers.samples import STILL, contact_poses, sample
 from oracles.distance import mesh_distance
 
 import warp_abtree as ab
 from warp_abtree import testing
 
 NAMES = ("box", "small ball", "crumbs", "soup", "torus", "three", "capsule", "one")
-FACES = 60
-
-
-def posed_pairs(rng, device, pairs, faces=FACES):
-    """Return a scene and its cases, of pairs of samples in contact or moved apart."""
-    cases = [random_case(rng, names, faces) for names in pairs]
-    for case in cases:
-        away = rng.normal(size=3)
-        case[5][:3] += (1 + 2 * rng.random()) * away / np.linalg.norm(away) * (rng.random() < 0.7)
-    return scene_of(device, cases), cases
 
 
 def check_distances(scene, pairs, distances, close=1e-9):
@@ -44,7 +34,8 @@ def distances_of(scene, cases):
 
 def test_equals_brute_force(device):
     rng = np.random.default_rng(1)
-    scene, cases = posed_pairs(rng, device, [tuple(rng.choice(NAMES, 2)) for _ in range(90)])
+    cases = parted_cases(rng, [tuple(rng.choice(NAMES, 2)) for _ in range(90)], least=1.0)
+    scene = scene_of(device, cases)
     distances = distances_of(scene, cases)
     assert 30 < (distances > 0).sum() < 85
     check_distances(scene, pairs_of(cases), distances)
@@ -106,12 +97,8 @@ def test_coarse_proof_holds_for_the_original_meshes(device):
 
 @pytest.mark.parametrize("exponent", [-60, 31])
 def test_scaling_by_a_power_of_two_changes_nothing(device, exponent):
-    rng = np.random.default_rng(5)
-    plain, cases = posed_pairs(rng, device, [("soup", "small ball")] * 20)
-    meshes = SHAPES["soup"](), SHAPES["small ball"]()
-    a, b = (ab.Model.from_arrays(np.ldexp(points, exponent), faces, base_faces=4) for points, faces in meshes)
-    by = np.array([2.0**exponent] * 3 + [1] * 4)
-    scaled = scene_of(device, [(a, i, by * p, b, j, by * q) for _, i, p, _, j, q in cases])
+    cases = parted_cases(np.random.default_rng(5), [("soup", "small ball")] * 20, least=1.0)
+    plain, scaled = scene_of(device, cases), scene_of(device, scale_cases(cases, exponent))
     distances = distances_of(plain, cases)
     for factor in (0, 1 - 1e-13, 1 - 1e-15, 1, 1 + 1e-15, 1 + 1e-13, 2):
         one = plain.intersect(pairs_of(cases), within=factor * distances)
@@ -122,16 +109,7 @@ def test_scaling_by_a_power_of_two_changes_nothing(device, exponent):
 @pytest.mark.parametrize("far", [1e3, 1e6])
 def test_far_from_the_origin(device, far):
     """Both objects far away; a mesh with coordinates far from its own origin. What is lost is in proportion."""
-    rng = np.random.default_rng(6)
-    shift = np.array([far, -far, 0.3 * far, 0, 0, 0, 0])
-    vertices, faces, _ = sample("small ball").mesh_at(sample("small ball").lod_max)
-    models = sample("torus"), ab.Model.from_arrays(vertices + shift[:3], faces, base_faces=4)
-    cases = []
-    for k in range(20):
-        a, b = [(models[k % 2], random_lod(rng, models[k % 2], FACES)), (sample("soup"), 40)][:: 1 if k % 4 < 2 else -1]
-        pose_a, pose_b = contact_poses(rng, *a, *b)
-        pose_b[:3] += 3 * rng.normal(size=3)
-        cases.append((*a, pose_a + shift, *b, pose_b + shift))
+    cases = far_cases(np.random.default_rng(6), far)
     scene = scene_of(device, cases)
     distances = distances_of(scene, cases)
     clear = distances > 0.01
@@ -154,8 +132,8 @@ def test_far_pairs_and_huge_distances(device, far):
 @pytest.mark.slow
 def test_regimes_and_outputs_agree(device):
     rng = np.random.default_rng(8)
-    scene, cases = posed_pairs(rng, device, [("torus", "soup")] * 30, faces=400)
-    pairs = pairs_of(cases)
+    cases = parted_cases(rng, [("torus", "soup")] * 30, faces=400, least=1.0)
+    scene, pairs = scene_of(device, cases), pairs_of(cases)
     within = rng.choice([0, 0.1, 0.5, 1.0], len(pairs))
     expected = scene.intersect(pairs, within=within)
     assert 3 < expected.apart.sum() < 27
@@ -169,9 +147,7 @@ def test_regimes_and_outputs_agree(device):
         for name in ("any", "count", "faces"):
             np.testing.assert_array_equal(getattr(result, name), getattr(plain, name))
     query.near.any_hit.fill_(7)
-    with wp.ScopedCapture(query.device) as capture:
-        query.launch()
-    wp.capture_launch(capture.graph)
+    captured(query)()
     np.testing.assert_array_equal(query.result().apart, expected.apart)
 
 
@@ -186,11 +162,9 @@ def test_query_takes_other_pairs_and_distances(device):
     ):
         query.set_pairs(*given)
         np.testing.assert_array_equal(query.run().apart, apart)
-    with pytest.raises(ValueError, match="2 pairs"):
-        query.set_pairs([(0, 1), (0, 2)])
+    refused(ValueError, "2 pairs", query.set_pairs, [(0, 1), (0, 2)])
     np.testing.assert_array_equal(query.run().apart, apart)
-    with pytest.raises(ValueError, match="without within"):
-        ab.Query(scene, "any", pairs=[(0, 1)]).set_pairs([(0, 1)], within=1.0)
+    refused(ValueError, "without within", ab.Query(scene, "any", pairs=[(0, 1)]).set_pairs, [(0, 1)], within=1.0)
     assert scene.intersect(np.empty((0, 2), int), within=1.0).apart.shape == (0,)
 
 

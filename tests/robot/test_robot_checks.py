@@ -10,16 +10,25 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from helpers.robots import described_arm, described_chain, pose_frames, random_configurations
+from helpers import refused
+from helpers.questions import captured
+from helpers.robots import (
+    AROUND,
+    RING,
+    ROOF,
+    asked_pairs,
+    described_arm,
+    described_chain,
+    pose_frames,
+    random_configurations,
+)
+from helpers.samples import STILL
+from helpers.scenes import scene_with
+from oracles.peers import fcl_object
 
 import warp_abtree as ab
 from warp_abtree.interop.robot import check, robot
 from warp_abtree.interop.robot.description import Description, RobotFrame
-
-STILL = (0, 0, 0, 0, 0, 0, 1)
-RING = ab.Model.load(trimesh.creation.torus(0.45, 0.12, 32, 12))
-ROOF = ab.Model.load(trimesh.creation.box((1.5, 0.1, 0.02)))
-AROUND = [(RING, (0, 0, 0.75, 0, 0, 0, 1)), (ROOF, (0, 0.3, 1.1, 0, 0, 0.6, 0.8))]
 
 
 @pytest.fixture
@@ -27,27 +36,13 @@ def arm(device):
     return ab.Robot(described_arm(), device, mounted=["base"])
 
 
-def fcl_object(model, matrix=None):
-    vertices, faces = model.mesh_at(model.lod_max)[:2]
-    tree = fcl.BVHModel()
-    tree.beginModel(len(vertices), len(faces))
-    tree.addSubModel(vertices, faces)
-    tree.endModel()
-    return fcl.CollisionObject(
-        tree, fcl.Transform() if matrix is None else fcl.Transform(matrix[:3, :3], matrix[:3, 3])
-    )
-
-
 class AskFcl:
     """Whether any pair intersects at a configuration, and the least distance, link by link."""
 
     def __init__(self, arm):
-        self.arm, others = arm, []
-        self.parts = [fcl_object(model) for model in arm.models]
-        for model, pose in AROUND:
-            matrix = trimesh.transformations.quaternion_matrix(np.roll(pose[3:], 1))
-            matrix[:3, 3] = pose[:3]
-            others.append(fcl_object(model, matrix))
+        self.arm = arm
+        self.parts = [fcl_object(*model.mesh_at(model.lod_max)[:2]) for model in arm.models]
+        others = [fcl_object(*model.mesh_at(model.lod_max)[:2], pose) for model, pose in AROUND]
         self.pairs = [(part, other) for k, part in enumerate(self.parts) if k != 0 for other in others]
         self.pairs += [(self.parts[i], self.parts[j]) for i, j in arm.pairs]
 
@@ -74,8 +69,7 @@ def test_pairs_leave_neighbours_and_excluded_links_out(device):
     # A mesh of the flange too, which is rigidly fixed to the forearm.
     description.parts.append(replace(description.parts[2], link=3))
     arm = ab.Robot(description, device)
-    names = [arm.link_names[k] for k in arm.model_link]
-    pairs = {frozenset((names[i], names[j])) for i, j in arm.pairs}
+    pairs = asked_pairs(arm)
     around = [(link, other) for link in ("fore", "flange") for other in ("upper", "left", "right", "flap")]
     left_out = {*map(frozenset, around), *map(frozenset, [("base", "upper"), ("fore", "flange"), ("base", "fore")])}
     assert not pairs & left_out and len(pairs) == len(arm.pairs) == 21 - len(left_out)
@@ -106,18 +100,17 @@ def test_beyond_ends_the_search(arm):
 
 
 def test_surroundings_are_a_scene_with_bits_lods_and_solids(arm, device):
-    scene = ab.Scene(device)
     shell = ab.Model.load(trimesh.creation.icosphere(subdivisions=2, radius=0.3))
-    scene.add(RING, AROUND[0][1], lod=RING.lod_for(fraction=0.2))
-    scene.add(shell, (0.4, 0.2, 0.7, 0, 0, 0, 1), solid=True)
-    scene.add(ROOF, AROUND[1][1], collision_group=2, collision_mask=2)
+    coarse, solid = {"lod": RING.lod_for(fraction=0.2)}, (shell, (0.4, 0.2, 0.7, 0, 0, 0, 1), {"solid": True})
+    aside = {"collision_group": 2, "collision_mask": 2}
+    scene = scene_with(device, (*AROUND[0], coarse), solid, (*AROUND[1], aside))
     rows = random_configurations(60, seed=3)
 
     def expected():
         one = ab.Scene(device)
         one.add_many(arm.models, np.tile(STILL, (len(arm.models), 1)))
-        one.add(RING, STILL, lod=scene.lods[0])
-        one.add(shell, STILL, solid=True)
+        one.add(RING, lod=scene.lods[0])
+        one.add(shell, solid=True)
         moving = [k for k in range(len(arm.models)) if arm.link_names[arm.model_link[k]] != "base"]
         pairs = [*arm.pairs.tolist(), *[(k, len(arm.models) + w) for k in moving for w in (0, 1)]]
         hits = []
@@ -177,30 +170,26 @@ def test_pairs_and_mounted_links_may_be_set(arm, device):
     ):
         other = copy.copy(arm)
         setattr(other, name, value)
-        with pytest.raises(ValueError, match=message):
-            other.check(rows, AROUND)
+        refused(ValueError, message, other.check, rows, AROUND)
 
 
 def test_a_query_is_captured_and_says_when_room_was_short(arm, device, monkeypatch):
     rows = random_configurations(20, seed=6)
     expected = arm.check(rows, AROUND)
     query = arm.query(AROUND, room=20)
-    with pytest.raises(RuntimeError, match="nothing was launched"):
-        query.check()
+    refused(RuntimeError, "nothing was launched", query.check)
     query.launch()
     query.check()
-    with wp.ScopedCapture(device) as capture:
-        query.launch()
+    replay = captured(query)
     query.configurations.assign(rows)
-    wp.capture_launch(capture.graph)
+    replay()
     query.check()
     np.testing.assert_array_equal(query.hit.numpy() != 0, expected)
     monkeypatch.setattr(check, "PAIRS_GUESS", 0)
     short = arm.query(AROUND, output="distance", room=20)
     short.configurations.assign(rows)
     short.launch()
-    with pytest.raises(ab.CapacityError, match="launch again"):
-        short.check()
+    refused(ab.CapacityError, "launch again", short.check)
     short.launch()
     short.check()
     np.testing.assert_array_equal(short.nearest.distance.numpy() == 0, expected)
@@ -218,8 +207,7 @@ def test_a_query_is_captured_and_says_when_room_was_short(arm, device, monkeypat
 )
 def test_bad_configurations_are_refused(arm, bad, message):
     for call in (arm.check, arm.forward):
-        with pytest.raises(ValueError, match=message):
-            call(bad)
+        refused(ValueError, message, call, bad)
 
 
 def test_limits_hold_to_within_rounding(arm, device):
@@ -235,17 +223,13 @@ def test_limits_hold_to_within_rounding(arm, device):
     assert len(arm.check(wp.zeros((3, 4), dtype=wp.int32, device=device), limits=False)) == 3
     assert len(arm.check(on_device)) == len(arm.check_edges(inside, inside)) == 4
     arm.exclude_meeting(high)
-    with pytest.raises(ValueError, match=r"has 3 for joint 'swing', outside -inf .. 2.5 "):
-        arm.check([[0, -1, 0, 3]])
+    refused(ValueError, r"has 3 for joint 'swing', outside -inf .. 2.5 ", arm.check, [[0, -1, 0, 3]])
     low, high = np.maximum(arm.limits, -9).T
     spread = low + 1.0 * (high - low)
     assert (spread > arm.limits[:, 1]).any() and len(arm.check([spread, np.nextafter(high, 9)])) == 2
     for beyond in (np.float32(0.1) + np.float32(4e-8), 0.1 * (1 + 2.0**-50)):
-        with pytest.raises(
-            ValueError, match=r"configuration 1 has (\S+) for joint 'grip', outside 0 .. (\S+) "
-        ) as raised:
-            arm.check([[0, -1, 0, 0], [0, -1, beyond, 0]])
-        told = re.search(r"has (\S+) for .* .. (\S+) ", str(raised.value))
+        said = r"configuration 1 has (\S+) for joint 'grip', outside 0 .. (\S+) "
+        told = re.search(said, str(refused(ValueError, said, arm.check, [[0, -1, 0, 0], [0, -1, beyond, 0]])))
         assert [float(number) for number in told.groups()] == [beyond, 0.1]
 
 
@@ -304,15 +288,12 @@ def test_a_robot_is_copied_and_pickled(arm):
         np.testing.assert_array_equal(other.check(rows, AROUND), expected)
         assert other.pairs.tolist() == arm.pairs.tolist() and other.mounted == arm.mounted
     for make in (copy.copy, copy.deepcopy, pickle.dumps):
-        with pytest.raises(TypeError, match="this RobotQuery holds device memory"):
-            make(arm.query(AROUND, room=1))
+        refused(TypeError, "this RobotQuery holds device memory", make, arm.query(AROUND, room=1))
 
 
 def test_bad_options_are_refused(arm, device):
     rows = np.zeros((1, 4))
-    other = ab.Scene(device)
-    other.add(RING, world=0)
-    other.add(RING, world=1)
+    other = scene_with(device, *[(*AROUND[0], {"world": world}) for world in (0, 1)])
     for call, error, message in (
         (lambda: arm.check(rows, output="faces"), ValueError, "neither 'any' nor 'distance'"),
         (lambda: arm.check(rows, beyond=1.0), ValueError, "beyond means nothing"),
@@ -326,8 +307,7 @@ def test_bad_options_are_refused(arm, device):
         (lambda: ab.Robot(described_arm(), device, mounted=["foot"]), ValueError, "no link 'foot'"),
         (lambda: ab.Robot(described_arm(), device, mounted="base"), TypeError, "'base' is a name"),
     ):
-        with pytest.raises(error, match=message):
-            call()
+        refused(error, message, call)
     assert arm.check(np.empty((0, 4))).shape == (0,) and len(arm.check_edges(rows[:0], rows[:0])) == 0
     assert arm.check(rows + [0, 3, 0, 0], limits=False).shape == (1,)
 
@@ -335,5 +315,4 @@ def test_bad_options_are_refused(arm, device):
 def test_a_robot_needs_a_mesh(device):
     empty = described_arm()
     empty.parts = []
-    with pytest.raises(ValueError, match="no link with a mesh"):
-        ab.Robot(empty, device)
+    refused(ValueError, "no link with a mesh", ab.Robot, empty, device)

@@ -4,13 +4,15 @@ import sys
 
 import numpy as np
 import pytest
-from helpers.robots import MJCF, URDF, random_configurations, write_arm
+from helpers import refused
+from helpers.robots import MJCF, URDF, asked_pairs, pairs_of, random_configurations, write_arm
 
 import warp_abtree as ab
 
 BEND_LIMIT, GRIP_LIMIT = (
     f'<limit lower="{low}" upper="{high}" effort="1" velocity="1"/>' for low, high in ((-2.8, 2.8), (0, 0.1))
 )
+FLEX = """<flexcomp name="rag" type="grid" count="3 3 1" spacing="1 1 1" dim="2"><edge equality="true"/></flexcomp>"""
 SRDF = '<robot name="arm"><disable_collisions link1="{}" link2="fore" reason="Never"/></robot>'
 
 
@@ -24,16 +26,6 @@ def urdf(tmp_path):
 def mjcf(tmp_path):
     pytest.importorskip("mujoco")
     return write_arm(tmp_path, MJCF, "arm.xml")
-
-
-def asked_pairs(robot):
-    """Return the pairs of names of links that are tested."""
-    names = [robot.link_names[k] for k in robot.model_link]
-    return {frozenset((names[i], names[j])) for i, j in robot.pairs}
-
-
-def pairs_of(*names):
-    return {frozenset(pair.split()) for pair in names}
 
 
 def test_urdf_poses_are_those_of_yourdfpy(urdf, device):
@@ -139,11 +131,7 @@ def test_a_limit_that_urdf_leaves_out_is_zero(urdf):
         ('lower="-2.8"', 'lower="nan"', "joint 'bend': limits nan .. 2.8 leave no value"),
         (BEND_LIMIT, "", "joint 'bend' is revolute and has no limits; .*, or make it continuous$"),
         (BEND_LIMIT, '<limit effort="1" velocity="1"/>', "joint 'bend' is revolute and has no limits"),
-        (
-            '<limit lower="0" upper="0.1" effort="1" velocity="1"/>',
-            "",
-            r"'grip' is prismatic and has no limits; .*\.\.>$",
-        ),
+        (GRIP_LIMIT, "", r"'grip' is prismatic and has no limits; .*\.\.>$"),
         ('size="0.08 0.08 0.5"', 'size="0.08 0.5"', "link 'upper': sizes .* are not 3"),
         ('radius="0.1" length', 'radius="-0.1" length', "link 'base': sizes .* are not 2"),
         ('radius="0.03"', 'radius="nan"', "link 'left': sizes .* are not 1"),
@@ -158,8 +146,7 @@ def test_a_limit_that_urdf_leaves_out_is_zero(urdf):
 def test_bad_urdf_is_refused(urdf, before, after, message):
     assert before in URDF
     urdf.write_text(URDF.replace(before, after), encoding="utf-8")
-    with pytest.raises(ValueError, match=message):
-        ab.Robot.load(urdf, device="cpu")
+    refused(ValueError, message, ab.Robot.load, urdf, device="cpu")
 
 
 @pytest.mark.parametrize(
@@ -170,26 +157,16 @@ def test_bad_urdf_is_refused(urdf, before, after, message):
         ('type="cylinder" size="0.1 0.1"', 'name="ground" type="plane" size="1 1 1"', "geom 'ground' is a plane"),
         ('polycoef="-0.04 -1 0 0 0"', 'polycoef="0 -1 1 0 0"', "follows another by a curve"),
         ("</equality>", '<joint joint1="follow" joint2="turn"/></equality>', "joint 'follow' follows two others"),
-        (
-            "</body></worldbody>",
-            '<flexcomp name="rag" type="grid" count="3 3 1" spacing="1 1 1" dim="2"><edge equality="true"/>'
-            "</flexcomp></body></worldbody>",
-            "flex 'rag' may deform",
-        ),
+        ("</body></worldbody>", FLEX + "</body></worldbody>", "flex 'rag' may deform"),
         ('file="part.stl"', 'file="lost.stl"', "lost.stl"),
         ('<body name="flange" pos="0 0 0.45">', '<body><body name="body 4"/>', "2 bodies have the name 'body 4'"),
-        (
-            '<joint name="turn" axis="0 0 1"/>',
-            '<joint/><joint name="joint 0" axis="1 0 0"/>',
-            "2 joints have the name 'joint 0'",
-        ),
+        ('<joint name="turn" axis="0 0 1"/>', '<joint/><joint name="joint 0"/>', "2 joints have the name 'joint 0'"),
     ],
 )
 def test_bad_mjcf_is_refused(mjcf, before, after, message):
     assert before in MJCF
     mjcf.write_text(MJCF.replace(before, after), encoding="utf-8")
-    with pytest.raises(ValueError, match=message):
-        ab.Robot.load(mjcf, device="cpu")
+    refused(ValueError, message, ab.Robot.load, mjcf, device="cpu")
 
 
 def test_formats_are_told_apart_and_a_geometry_without_meshes_is_named(urdf, mjcf, tmp_path):
@@ -199,15 +176,14 @@ def test_formats_are_told_apart_and_a_geometry_without_meshes_is_named(urdf, mjc
     ):
         # A comment before the root counts for nothing.
         (tmp_path / name).write_text("<!-- <mujoco> <robot> -->" + source.read_text("utf-8"), encoding="utf-8")
-        with pytest.raises(ValueError, match=message):
-            ab.Robot.load(tmp_path / name, device="cpu")
+        refused(ValueError, message, ab.Robot.load, tmp_path / name, device="cpu")
     urdf.write_text(
         '<robot name="r"><link name="l"><visual><geometry><sphere radius="1"/></geometry></visual></link></robot>'
     )
     mjcf.write_text('<mujoco><worldbody><geom size="1" contype="0" conaffinity="0"/></worldbody></mujoco>')
     for path in (urdf, mjcf):
-        with pytest.raises(ValueError, match=f"{path.name}: no link has a mesh of geometry='collision'; .* 'visual'"):
-            ab.Robot.load(path, device="cpu")
+        said = f"{path.name}: no link has a mesh of geometry='collision'; .* 'visual'"
+        refused(ValueError, said, ab.Robot.load, path, device="cpu")
         assert len(ab.Robot.load(path, "visual", device="cpu").models) == 1
 
 
@@ -278,8 +254,7 @@ def test_bad_paths_and_options_are_refused(urdf, tmp_path):
         ({"path": urdf, "neutral": [0, 0]}, r"shape \(1, 2\)"),
         ({"path": urdf, "device": "cuda:9"}, "no device 'cuda:9'"),
     ):
-        with pytest.raises(ValueError, match=message):
-            ab.Robot.load(**arguments)
+        refused(ValueError, message, ab.Robot.load, **arguments)
 
 
 @pytest.mark.parametrize("name, library", [("arm.urdf", "yourdfpy"), ("arm.xml", "mujoco")])

@@ -1,4 +1,4 @@
-"""Meshes of URDF files: where they are sought, units of Collada, and mirrored ones."""
+"""Meshes of URDF files, and pairs of links with an SRDF file as MoveIt's matrix of allowed collisions has them."""
 
 import gzip
 import warnings
@@ -7,6 +7,8 @@ import zipfile
 import numpy as np
 import pytest
 import trimesh
+from helpers import refused
+from helpers.robots import asked_pairs, pairs_of
 
 import warp_abtree as ab
 
@@ -81,12 +83,10 @@ def test_collada_nodes_may_be_mirrored(scale, tmp_path):
 @pytest.mark.parametrize("unit", ["0", "-1", "nan", "inf", "inch"])
 def test_units_that_are_none_are_refused(unit, tmp_path):
     write_dae(tmp_path / "part.dae", f'<unit meter="{unit}"/>')
-    with pytest.raises(ValueError, match=f"link 'l': part.dae has a unit of '{unit}' meters"):
-        load(tmp_path, "part.dae")
+    refused(ValueError, f"link 'l': part.dae has a unit of '{unit}' meters", load, tmp_path, "part.dae")
     with zipfile.ZipFile(tmp_path / "part.zae", "w") as archive:
         archive.write(tmp_path / "part.dae", "part.dae")
-    with pytest.raises(ValueError, match=r"link .l.: part\.zae is an archive; unpack the \.dae of it"):
-        load(tmp_path, "part.zae")
+    refused(ValueError, r"link .l.: part\.zae is an archive; unpack the \.dae of it", load, tmp_path, "part.zae")
 
 
 @pytest.mark.parametrize(
@@ -128,8 +128,119 @@ def test_what_joints_do_not_place_is_named(tmp_path):
         load(tmp_path, "part.stl", rest='<link name="m"/><link name="n"/>')
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(RuntimeWarning, match="not enforced"):
-            load(tmp_path, "part.stl", rest=loops)
-        load(
-            tmp_path, "part.stl", rest='<gazebo reference="l"/><transmission name="t"><joint name="x"/></transmission>'
-        )
+        refused(RuntimeWarning, "not enforced", load, tmp_path, "part.stl", rest=loops)
+        others = '<gazebo reference="l"/><transmission name="t"><joint name="x"/></transmission>'
+        load(tmp_path, "part.stl", rest=others)
+
+
+pytest.importorskip("yourdfpy")
+LINKS = [f"l{k}" for k in range(5)]
+LINK = '<link name="{}"><collision><geometry><box size="0.1 0.1 0.2"/></geometry></collision></link>'
+JOINT = (
+    '<joint name="j{1}" type="{0}"><parent link="l{1}"/><child link="l{2}"/><origin xyz="0 0 0.3"/>'
+    '<axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>'
+)
+ALL = {frozenset((a, b)) for a in LINKS for b in LINKS if a < b}
+# The last two links are fixed to one another: neighbours of neither are tested unless an SRDF says so.
+JOINED = pairs_of("l0 l1", "l1 l2", "l2 l3", "l3 l4", "l2 l4")
+
+
+@pytest.fixture
+def load_pairs(tmp_path):
+    kinds = "revolute", "revolute", "revolute", "fixed"
+    joints = "".join(JOINT.format(kind, k, k + 1) for k, kind in enumerate(kinds))
+    (tmp_path / "r.urdf").write_text(f'<robot name="r">{"".join(map(LINK.format, LINKS))}{joints}</robot>')
+
+    def load_pairs(srdf, root="robot", **options):
+        (tmp_path / "r.srdf").write_text(f'<{root} name="r">{srdf}</{root}>', encoding="utf-8")
+        return asked_pairs(ab.Robot.load(tmp_path / "r.urdf", device="cpu", srdf=tmp_path / "r.srdf", **options))
+
+    return load_pairs
+
+
+def moveit_pairs(entries):
+    """Return the pairs that are tested: a link's default, then entries of pairs, first enabled, then disabled ones."""
+    default, matrix = set(), {}
+    for tag, allowed in (("disable_default_collisions", None), ("enable_collisions", False), ("disable_collisions", 1)):
+        for name, *links in entries:
+            if name == tag:
+                default |= set(links) if allowed is None else set()
+                matrix |= {} if allowed is None else {frozenset(links): allowed}
+    return {pair for pair in ALL if not matrix.get(pair, bool(pair & default) or pair in JOINED)}
+
+
+def write(entries):
+    return "".join(
+        f'<{tag} link="{links[0]}"/>' if len(links) == 1 else f'<{tag} link1="{links[0]}" link2="{links[1]}"/>'
+        for tag, *links in entries
+    )
+
+
+def test_pairs_are_those_of_moveit(load_pairs):
+    assert load_pairs("") == ALL - JOINED
+    rng, found = np.random.default_rng(0), []
+    for _ in range(40):
+        entries = [("disable_default_collisions", *rng.choice(LINKS, 1)) for _ in range(rng.integers(3))]
+        for tag in ("enable_collisions", "disable_collisions"):
+            entries += [(tag, *rng.choice(LINKS, 2, replace=False)) for _ in range(rng.integers(5))]
+        rng.shuffle(entries)
+        found.append(load_pairs(write(entries)))
+        assert found[-1] == moveit_pairs(entries), entries
+    assert any(pairs & JOINED for pairs in found) and any(ALL - JOINED - pairs for pairs in found)
+
+
+def test_only_entries_of_the_robot_itself_count(load_pairs):
+    assert load_pairs('<group name="g"><disable_collisions link1="l0" link2="l2"/></group>') == ALL - JOINED
+    assert load_pairs('<disable_collisions link1=" l0 " link2="l2"/>') == ALL - JOINED - pairs_of("l0 l2")
+
+
+def test_links_that_the_robot_lacks_are_refused_or_named(load_pairs):
+    entries = '<disable_collisions link1="l0" link2="l2"/><disable_collisions link1="l0" link2="camera"/>'
+    entries += '<enable_collisions link1="mast" link2="l1"/><disable_default_collisions link="camera"/>'
+    refused(ValueError, r"disable_default_collisions names 'camera', .* \(strict=False goes on\)", load_pairs, entries)
+    with pytest.warns(RuntimeWarning, match=r"r.srdf: what is said of 'camera', 'mast' is left out") as caught:
+        assert load_pairs(entries, strict=False) == ALL - JOINED - pairs_of("l0 l2")
+    assert len(caught) == 1 and caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_pairs(write([("disable_collisions", "l0", "l2")]), strict=False)
+
+
+def test_unknown_elements_are_named(load_pairs):
+    with pytest.warns(RuntimeWarning, match="r.srdf: not read: elements disable_collision, hand$") as caught:
+        assert load_pairs('<disable_collision link1="l0" link2="l2"/><hand/><hand/>') == ALL - JOINED
+    assert len(caught) == 1 and caught[0].filename == __file__
+    known = "group group_state end_effector virtual_joint passive_joint joint_property link_sphere_approximation"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_pairs("<!-- none -->" + "".join(f"<{tag}/>" for tag in known.split()))
+
+
+@pytest.mark.parametrize(
+    "srdf, root, message",
+    [
+        ('<disable_collisions link1="l0"/>', "robot", "a disable_collisions without link2"),
+        ("<disable_default_collisions/>", "robot", "a disable_default_collisions without link"),
+        ("<enable_collisions", "robot", "not read as SRDF"),
+        ("", "srdf", "not read as SRDF .its root is 'srdf', not 'robot'"),
+    ],
+)
+def test_bad_srdf_is_refused(srdf, root, message, load_pairs):
+    refused(ValueError, message, load_pairs, srdf, root, strict=False)
+
+
+def test_an_srdf_goes_over_the_pairs_of_mjcf(tmp_path):
+    pytest.importorskip("mujoco")
+    bodies = "".join(
+        f'<body name="l{k}" pos="0 0 {k}"><joint name="j{k}"/><geom name="g{k}" size=".1"/><geom size=".1" contype="2" '
+        f'conaffinity="2"/></body>'
+        for k in range(3)
+    )
+    pairs = '<contact><pair geom1="g0" geom2="g1"/><exclude body1="l1" body2="l2"/></contact>'
+    (tmp_path / "r.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody>{pairs}</mujoco>", encoding="utf-8")
+    entries = [("enable_collisions", "l1", "l2"), ("disable_collisions", "l1", "l0")]
+    (tmp_path / "r.srdf").write_text(f"<robot>{write(entries)}</robot>", encoding="utf-8")
+    robot = ab.Robot.load(tmp_path / "r.xml", device="cpu", srdf=tmp_path / "r.srdf")
+    found = [tuple(sorted(robot.link_names[robot.model_link[k]] for k in pair)) for pair in robot.pairs]
+    # Parts of links 0 and 2 by their bits, all of links 1 and 2.
+    assert sorted(found) == [("l0", "l2")] * 2 + [("l1", "l2")] * 4

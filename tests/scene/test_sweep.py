@@ -9,8 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
+from helpers import refused
 from helpers.questions import GpuQuery
 from helpers.samples import SHAPES, STILL, random_poses, sample
+from helpers.scenes import scene_with
 
 import warp_abtree as ab
 from warp_abtree.checks.device_lock import device_lock
@@ -32,8 +34,7 @@ def small_chunks(monkeypatch):
 
 def ask_scene(device, models, poses, lod_a=None, **options):
     """Return the faces of a scene with an object a pose."""
-    scene = ab.Scene(device)
-    scene.add(models[0], STILL, lod=lod_a)
+    scene = scene_with(device, (models[0], STILL), lod=lod_a)
     for pose in poses:
         scene.add(models[1], pose)
     return scene.intersect([(0, i + 1) for i in range(len(poses))], output="faces", **options)
@@ -123,8 +124,7 @@ def test_the_first_bad_pose_is_named(device, kind, small_chunks):
     ):
         bad = poses.copy()
         bad[[16, 18, 25], column] *= factor
-        with pytest.raises(ValueError, match=what):
-            ask(bad)
+        refused(ValueError, what, ask, bad)
         np.testing.assert_array_equal(ask(poses), expected)
     just = poses.copy()
     just[:, 3:] *= 1.000999
@@ -147,8 +147,7 @@ def test_refused(device, kept):
         ("no device", {"device": "cuda:99"}),
         ("not a Model", {"model_b": "torus"}),
     ):
-        with pytest.raises(TypeError if what == "not a Model" else ValueError, match=what):
-            ab.sweep(**{**asked, **options})
+        refused(TypeError if what == "not a Model" else ValueError, what, ab.sweep, **{**asked, **options})
     assert not kept
 
 

@@ -1,13 +1,18 @@
-"""With `continuous` surfaces that are apart stay apart, however fast bodies are."""
+"""Fast bodies: with `continuous` surfaces stay apart; without it bodies that look ahead stop at the surface."""
 
 import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from helpers.bodies import BRICK, TORUS, about, bits, box, make, model_of, on_ground
+from helpers import refused
+from helpers.bodies import BRICK, TORUS, about, bits, box, make, model_of, on_ground, run
+from helpers.questions import captured
+from helpers.samples import STILL
+from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree.query.request import Buffers, CapacityError
+from warp_abtree.simulate.body_state import mass_properties
 
 SHEET = box(0.4, 0.4, 0.001)
 BULLET = model_of(trimesh.creation.icosphere(1, 0.005))
@@ -98,8 +103,7 @@ def test_a_heap_falls_and_comes_to_rest_without_more_energy(device):
 
 def test_a_body_rests_about_a_slop_above_the_floor(device):
     dynamics = on_ground(device, (box(0.8, 0.6, 0.4), (0, 0, 0.5, *about((0, 0, 1), 0.3))), continuous=True)
-    for _ in range(60):
-        dynamics.step(1 / 60)
+    run(dynamics, 60, 1 / 60)
     slop = dynamics.bodies.bounding_radius.numpy()[1] / 512
     assert 0.2 + 0.4 * slop < dynamics.poses()[1, 2] < 0.2 + 1.6 * slop
     assert dynamics.certified.fraction.numpy()[1] == 1
@@ -116,13 +120,12 @@ def test_bodies_that_overlap_at_first_are_not_stopped(device):
 
 def test_a_kinematic_object_stops_too_and_catches_up(device):
     """It presses a brick on the floor, and is late for its target until it turns back."""
-    dynamics = on_ground(
-        device, (BRICK, (0, 0, 0.3, 0, 0, 0, 1)), (BRICK, (0, 0, 1.0, 0, 0, 0, 1)), kinematic=[2], continuous=True
-    )
+    bricks = [(BRICK, (0, 0, z, 0, 0, 0, 1)) for z in (0.3, 1.0)]
+    dynamics = on_ground(device, *bricks, kinematic=[2], continuous=True)
     for z in (0.9, 0.6, 0.4):
-        dynamics.step(1 / 60, [[0, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0, 1], [0, 0, z, 0, 0, 0, 1]])
+        dynamics.step(1 / 60, [STILL, STILL, [0, 0, z, 0, 0, 0, 1]])
     assert 0.75 < dynamics.poses()[2, 2] < 0.82 and not surfaces_meet(dynamics)
-    dynamics.step(1 / 60, [[0, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0, 1], [0, 0, 1.5, 0, 0, 0, 1]])
+    dynamics.step(1 / 60, [STILL, STILL, [0, 0, 1.5, 0, 0, 0, 1]])
     assert dynamics.poses()[2, 2] == 1.5
 
 
@@ -132,14 +135,12 @@ def test_steps_repeat_to_the_bit_and_in_a_captured_graph(device):
         return on_ground(device, *placed, velocity=(0, 0, -20.0), continuous=True, **options)
 
     first, second = thrown(), thrown()
-    for _ in range(12):
-        first.step(1 / 60)
+    run(first, 12, 1 / 60)
     if wp.get_device(device).is_cuda:
         second.step(1 / 60)
-        with wp.ScopedCapture(device) as capture:
-            second.launch(1 / 60)
+        replay = captured(second, 1 / 60)
         for _ in range(11):
-            wp.capture_launch(capture.graph)
+            replay()
     else:
         for _ in range(12):
             second.launch(1 / 60)
@@ -157,8 +158,7 @@ def test_a_step_without_room_for_pairs_moves_nothing_and_says_so(device):
     dynamics._grow()
     dynamics.launch(1 / 60)
     np.testing.assert_array_equal(dynamics.poses(), before)
-    with pytest.raises(CapacityError, match="Buffers\\(pairs="):
-        dynamics.check()
+    refused(CapacityError, "Buffers\\(pairs=", dynamics.check)
     dynamics.finish(1 / 60)
     assert not np.array_equal(dynamics.poses(), before) and not surfaces_meet(dynamics)
 
@@ -185,3 +185,74 @@ def test_a_body_that_strikes_the_floor_stays_there(device, speed):
         dynamics.step(1 / 60)
         assert dynamics.poses()[1, 2] < 0.2 + 2 * slop
     assert np.abs(dynamics.velocities()[0][1]).max() < 0.01
+
+
+BOX = model_of(trimesh.creation.box((0.8, 0.6, 0.4)))
+FINE_TORUS = model_of(trimesh.creation.torus(0.5, 0.2, 64, 16))
+FINE_BALL = model_of(trimesh.creation.icosphere(4, 0.5))
+
+
+def depth_in_floor(dynamics, model, i=1):
+    """How far the lowest vertex is below the floor, in slops of the body."""
+    pose = dynamics.poses()[i]
+    vertices = model.mesh_at(model.lod_max)[0] @ quaternion_matrix(pose[3:]).T + pose[:3]
+    return -vertices[:, 2].min() / (mass_properties(model).bounding_radius / 512)
+
+
+@pytest.mark.parametrize("speed", [2.0, 6.0])
+@pytest.mark.parametrize("turn", [0.0, 0.4])
+def test_a_box_that_falls_stops_at_the_surface(device, speed, turn):
+    """In a step it moves by up to 100 slops; it never sinks by more than a few."""
+    pose = (0, 0, 1.0, *about((1, 2, 0), turn))
+    dynamics = on_ground(device, (BOX, pose), velocity=(0, 0, -speed), friction=0.3)
+    worst = -np.inf
+    for _ in range(90):
+        dynamics.step(1 / 60)
+        worst = max(worst, depth_in_floor(dynamics, BOX))
+    assert -0.1 < depth_in_floor(dynamics, BOX) < 2
+    assert worst < (4 if turn == 0 else 30)
+    assert np.abs(dynamics.velocities()[0]).max() < 0.05
+
+
+@pytest.mark.parametrize("model, most", [(FINE_TORUS, 1.5), (FINE_BALL, 2.0)])
+def test_fine_meshes_rest_a_few_slops_deep_at_60_steps_a_second(device, model, most):
+    low = model.mesh_at(model.lod_max)[0][:, 2].min()
+    dynamics = on_ground(device, (model, (0, 0, 0.3 - low, *about((0, 0, 1), 0.3))))
+    run(dynamics, 90, 1 / 60)
+    assert -0.1 < depth_in_floor(dynamics, model) < most
+
+
+def test_bodies_that_fly_together_have_no_contacts(device):
+    """Their reach is that of their relative motion, whatever the speed."""
+    placed = [(BOX, (0.9 * k, 0, 0, 0, 0, 0, 1)) for k in range(3)]
+    dynamics = make(device, *placed, velocity=(0, 0, 20.0), gravity=(0, 0, 0))
+    run(dynamics, 3, 1 / 60)
+    assert len(dynamics.query.result().points["pair"]) == 0
+    np.testing.assert_allclose(dynamics.velocities()[0], [[0, 0, 20.0]] * 3)
+
+
+def test_a_body_that_passes_by_is_not_touched(device):
+    """Over a floor, not towards it: contacts ahead hold nothing that does not come nearer."""
+    dynamics = on_ground(device, (BOX, (-2, 0, 0.205, 0, 0, 0, 1)), velocity=(6.0, 0, 0), gravity=(0, 0, 0))
+    run(dynamics, 30, 1 / 60)
+    np.testing.assert_allclose(dynamics.velocities()[0][1], [6.0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(dynamics.poses()[1, :3], [1.0, 0, 0.205], atol=1e-12)
+
+
+def test_only_faces_about_the_nearest_are_contacts_ahead(device):
+    """Of a fine ball that falls fast: as far as its distance from the floor and half a face."""
+    height, speed = 0.6, 9.0
+    dynamics = on_ground(device, (FINE_BALL, (0, 0, height, 0, 0, 0, 1)), velocity=(0, 0, -speed))
+    dynamics.find()
+    query = dynamics.query
+    distance = ab.DistanceQuery(dynamics.scene, [(0, 1)]).run().bracket[0, 1]
+    radius = dynamics.bodies.bounding_radius.numpy()[1]
+    faces = len(FINE_BALL.mesh_at(FINE_BALL.lod_max)[1])
+    gap = query.hits.gap.numpy()[0]
+    np.testing.assert_allclose(gap, distance + radius * np.sqrt(np.pi / faces), rtol=1e-4)
+    reach = np.linalg.norm(dynamics.bodies.reach.numpy()[1][:3])
+    assert gap < reach
+    near = ab.ContactQuery(dynamics.scene, [(0, 1)], gap=[gap]).run()
+    assert query.hits.count.numpy()[0] == near.count[0] > 0
+    far = ab.ContactQuery(dynamics.scene, [(0, 1)], gap=[reach]).run()
+    assert far.count[0] > 1.5 * near.count[0]

@@ -1,15 +1,26 @@
-"""Rigid bodies: what is kept in collisions, what comes to rest and stays, against closed forms and plain Python."""
+"""Rigid bodies against closed forms and plain Python; prescribed motion, graph coloring and reports of budgets."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
+from helpers import refused
 from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, TORUS, about, box, make, model_of, on_ground, run
+from helpers.samples import grid
+from trimesh.transformations import quaternion_matrix, rotation_matrix
 
 import warp_abtree as ab
-from warp_abtree.checks.quaternions import matrices_of
+from warp_abtree.checks.quaternions import matrices_of, quaternions_of
+from warp_abtree.checks.upload import zeros_of
+from warp_abtree.kernels.base.poses import PairBatch
+from warp_abtree.kernels.bodies import bodies as body_kernels
+from warp_abtree.kernels.bodies import graph_coloring
 from warp_abtree.simulate.body_state import mass_properties
+from warp_abtree.simulate.budget_report import budget_report, cost_at_coarsest
+from warp_abtree.simulate.frame_row import FrameRow
 
 
 @cache
@@ -52,12 +63,11 @@ def test_an_open_mesh_has_the_mass_of_its_convex_hull(monkeypatch):
     mesh = trimesh.creation.box((1, 2, 3))
     for faces in (np.delete(mesh.faces, [0, 5], axis=0), mesh.faces[:, ::-1]):
         assert mass_properties(ab.Model.from_arrays(mesh.vertices, faces)).volume == pytest.approx(6.0)
-    with pytest.raises(ValueError, match="flat"):
-        mass_properties(ab.Model.from_arrays([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]], [[0, 1, 2], [0, 2, 3]]))
+    refused(ValueError, "flat", mass_properties, ab.Model.from_arrays(*grid(1)))
     missing = trimesh.exceptions.ExceptionWrapper(ModuleNotFoundError("No module named 'scipy'"))
     monkeypatch.setattr(trimesh.convex, "ConvexHull", missing)
-    with pytest.raises(ValueError, match="'open' is not closed: its convex hull needs scipy"):
-        mass_properties(ab.Model.from_arrays(mesh.vertices, mesh.faces[1:], name="open"))
+    model = ab.Model.from_arrays(mesh.vertices, mesh.faces[1:], name="open")
+    refused(ValueError, "'open' is not closed: its convex hull needs scipy", mass_properties, model)
 
 
 def tumble(moments, momentum, rotation, time, steps):
@@ -109,9 +119,8 @@ def test_free_collisions_keep_momentum_and_angular_momentum(device, seed, fricti
     rng = np.random.default_rng(seed)
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])[rng.permutation(8)[:6]]
     turns = rng.normal(size=(6, 4))
-    placed = [
-        (model, (*(1.1 * p), *(q / np.linalg.norm(q)))) for model, p, q in zip((BRICK, BALL, TORUS) * 2, corners, turns)
-    ]
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    placed = [(model, (*(1.1 * p), *q)) for model, p, q in zip((BRICK, BALL, TORUS) * 2, corners, turns)]
     before = -corners * rng.uniform(0.7, 1.0, (6, 1)) + rng.normal(0, 0.1, (6, 3))
     omega = rng.normal(size=(6, 3))
     dynamics = make(device, *placed, friction=friction, velocity=before, angular_velocity=omega, gravity=(0, 0, 0))
@@ -145,9 +154,8 @@ def test_cubes_face_to_face(device):
 def test_corrections_of_place_leave_velocity_and_energy(device):
     """A brick deep in the floor that leaves it slowly: it is lifted and rotated, but keeps its velocities."""
     pose = (0, 0, 0.4, *about((0.3, 1, 0), 0.5))
-    dynamics = on_ground(
-        device, (box(1.2, 0.9, 0.5), pose), velocity=(0, 0, 0.3), angular_velocity=(0, 0, 2), gravity=(0, 0, 0)
-    )
+    moving = {"velocity": (0, 0, 0.3), "angular_velocity": (0, 0, 2), "gravity": (0, 0, 0)}
+    dynamics = on_ground(device, (box(1.2, 0.9, 0.5), pose), **moving)
     start = totals(dynamics)
     dynamics.step(0.01)
     found = totals(dynamics)
@@ -235,3 +243,130 @@ def test_a_kinematic_floor_carries_and_stops(device):
     assert omega[1, 2] == pytest.approx(0.4, abs=0.02), "friction rotates the cube along"
     run(dynamics, 120)
     assert np.abs(dynamics.velocities()).max() < 1e-6
+
+
+COLORS = int(graph_coloring.COLOR_COUNT)
+
+
+def color_pairs(device, pairs, dynamic, rounds):
+    """Return the color of each pair, COLORS where it has none."""
+    bodies = zeros_of(body_kernels.Bodies, len(dynamic), 0, device)
+    bodies.motion_type.assign(np.where(dynamic, int(body_kernels.DYNAMIC), 0))
+    bodies.rank.assign(np.arange(len(dynamic)))
+    color = wp.full(len(pairs), COLORS, dtype=wp.int32, device=device)
+    batch = PairBatch()
+    batch.pairs = wp.array(pairs, dtype=wp.vec2i, device=device)
+    for turn in range(COLORS * rounds):
+        for kernel in (graph_coloring.bid_kernel, graph_coloring.assign_color_kernel):
+            wp.launch(kernel, len(pairs), [turn, rounds, batch, color, bodies], device=device)
+    return color.numpy()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_moving_body_is_twice_in_a_color(device, seed):
+    rng = np.random.default_rng(seed)
+    pairs = np.unique(np.sort(rng.integers(0, 300, (750, 2)), axis=1), axis=0)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    dynamic = rng.uniform(size=300) < 0.9
+    pairs = pairs[dynamic[pairs].any(1)]
+    degree = np.bincount(pairs.ravel(), minlength=300)[dynamic].max()
+    used = []
+    for rounds in (1, 2, 4):
+        color = color_pairs(device, pairs, dynamic, rounds)
+        assert np.array_equal(color, color_pairs(device, pairs, dynamic, rounds)), "the same again"
+        for c in range(COLORS):
+            movers = pairs[color == c].ravel()
+            movers = movers[dynamic[movers]]
+            assert len(set(movers.tolist())) == len(movers)
+        used.append(len(set(color.tolist())))
+    # Of one round there are many; of more hardly more than there must be.
+    assert degree <= used[2] <= used[1] < used[0] and used[2] <= degree + 2
+
+
+def test_motion_in_a_straight_line():
+    motion = ab.Kinematic(position=[[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]], velocity=[[1.0, 0.0, -2.0], [0.0, 0.5, 0.0]])
+    assert np.allclose(motion.poses(4.0), [[5, 2, -5, 0, 0, 0, 1], [0, 2, 0, 0, 0, 0, 1]])
+    assert np.allclose(motion.poses(-1.0)[:, :3], [[0, 2, 5], [0, -0.5, 0]])
+
+
+def test_rotation_about_an_axis():
+    rng = np.random.default_rng(1)
+    axis, rate = rng.normal(size=(8, 3)), rng.uniform(-3, 3, 8)
+    start = rng.normal(size=(8, 4))
+    start /= np.linalg.norm(start, axis=1, keepdims=True)
+    motion = ab.Kinematic(position=np.zeros((8, 3)), rotation=start, axis=axis, rate=rate)
+    buffer = np.empty((8, 7))
+    for time in (0.0, 0.3, 7.7, -2.0):
+        poses = motion.poses(time)
+        assert motion.poses(time, out=buffer) is buffer and np.array_equal(buffer, poses)
+        assert np.allclose(np.linalg.norm(poses[:, 3:], axis=1), 1.0, atol=1e-15)
+        for i in range(8):
+            expected = rotation_matrix(rate[i] * time, axis[i]) @ quaternion_matrix(np.roll(start[i], 1))
+            assert np.allclose(quaternion_matrix(np.roll(poses[i, 3:], 1)), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("time", "way"), [(0.0, 0.5), (0.5, 1.0), (0.8, 0.7), (1.5, 0.0), (1.7, 0.2), (6.5, 1.0)])
+def test_shuttle_reflects_at_its_ends(time, way):
+    motion = ab.Kinematic(position=[[0.5, 0.0, 1.0]], shuttle=[1.0, -2.0, 0.5], period=2.0, phase=0.25)
+    assert np.allclose(motion.poses(time)[0, :3], [0.5 + way, -2.0 * way, 1.0 + 0.5 * way])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"position": [0.0, 0.0, 0.0]},
+        {"velocity": np.zeros((2, 3))},
+        {"velocity": [np.nan, 0, 0]},
+        {"rotation": [0.0, 0.0, 0.0, 2.0]},
+        {"axis": [0.0, 0.0, 0.0], "rate": 1.0},
+        {"period": 0.0},
+        {"period": np.nan},
+    ],
+)
+def test_motion_refuses(wrong):
+    refused(ValueError, next(iter(wrong)), ab.Kinematic, **{"position": np.zeros((3, 3)), **wrong})
+
+
+def test_quaternions_of_all_rotations():
+    q = np.random.default_rng(0).normal(size=(200, 4))
+    q = np.concatenate([q, np.eye(4), [[1, 1, 0, 0], [0, 1, 1, 1e-12], [1e-9, 1, 0, 1]]])
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    expected = [quaternion_matrix(np.roll(row, 1))[:3, :3] for row in q]
+    np.testing.assert_allclose(matrices_of(q), expected, atol=1e-14)
+    np.testing.assert_allclose(matrices_of(quaternions_of(matrices_of(q))), expected, atol=1e-14)
+
+
+def make_rows(costs, budget=10.0, step=0.5):
+    rows = []
+    for i, cost in enumerate(costs):
+        values = dict.fromkeys(FrameRow.names()[:-1], 0)
+        values |= {"frame": i, "time": i * step, "objects": 4, "oscillations": i % 2, "error_mean": float(i)}
+        rows.append(FrameRow(**{**values, "budget_ms": budget, "query_ms": cost - 1.5, "answer_ms": 1.5}))
+    return rows
+
+
+def test_reports_count_frames_within_a_budget():
+    rows = make_rows([50, 50, 10, 10.5, 11, 11.5, 12, 8, 40, 9])
+    report = budget_report(rows)
+    assert report == {
+        "frames": 8,
+        "within": 3 / 8,
+        "within_110_percent": 5 / 8,
+        "worst": 4.0,
+        "longest_over": 2,
+        "oscillations": pytest.approx(4 / 4 / 4.0),
+        "error_mean": 5.5,
+    }
+    assert budget_report(rows, after=0.0)["within"] == 3 / 10
+    assert budget_report(rows, budget_ms=20.0)["within"] == 7 / 8
+    assert budget_report(rows, after=5.0) is None and budget_report(make_rows([1.0] * 9, None)) is None
+
+
+def at_lods(costs, lods):
+    return [replace(row, lod_max=lod) for row, lod in zip(make_rows(costs), lods, strict=True)]
+
+
+def test_a_budget_below_the_cost_of_the_coarsest_lods_is_impossible():
+    assert cost_at_coarsest(at_lods([99, 12, 14, 13, 9], [0, 0, 0, 0, 7])) == 13
+    assert cost_at_coarsest(at_lods([99, 12, 14, 9], [0, 0, 5, 7])) is None, "it climbs from there"
+    assert cost_at_coarsest(at_lods([99], [0])) is None and cost_at_coarsest([]) is None

@@ -6,7 +6,8 @@ import weakref
 import numpy as np
 import pytest
 import warp as wp
-from helpers.questions import in_a_row
+from helpers import refused
+from helpers.questions import captured, in_a_row
 from helpers.samples import STILL, sample
 from helpers.scenes import add_objects
 
@@ -32,12 +33,6 @@ def make_scene(device, count=4):
     return add_objects(device, ["torus"] * count, seed=1, spread=0.3)
 
 
-def capture(device, operator, *arguments):
-    with wp.ScopedCapture(device) as captured:
-        operator.launch(*arguments)
-    return captured.graph
-
-
 LEVELS = sample("torus").lod_max - 7 * np.arange(4)
 
 
@@ -54,31 +49,28 @@ def test_a_replay_after_arrays_were_replaced_is_refused(device, operator, pairs,
     """A launch and a new capture are not, where the query still fits the scene; filters concern found pairs alone."""
     scene = make_scene(device)
     query = operator(scene, pairs=pairs, capacity=20_000)
-    graph = capture(device, query)  # the broad phase's tree is built in it: nothing was launched before
-    wp.capture_launch(graph)
+    replay = captured(query)  # the broad phase's tree is built in it: nothing was launched before
+    replay()
     assert query.result().count.sum() == scene.intersect(pairs, output="count").count.sum() > 100
     CHANGES[change](scene)
-    wp.capture_launch(graph)
+    replay()
     if change == "filtered pairs" and pairs is not None:
         assert query.result().count[0] > 0
         query.launch()
         assert query.result().count[0] > 0
         return
-    with pytest.raises(RuntimeError, match=STALE):
-        query.result()
+    refused(RuntimeError, STALE, query.result)
     if change != "more tree states":
-        with pytest.raises(RuntimeError, match="filtered" if change == "filtered pairs" else "new one"):
-            query.launch()
+        refused(RuntimeError, "filtered" if change == "filtered pairs" else "new one", query.launch)
         found = operator(scene, pairs=pairs, capacity=20_000).run().pairs
         assert ([0, 1] in found.tolist()) == (change != "filtered pairs")
         return
     expected = scene.intersect(pairs, output="count").count.sum()
     query.launch()
     assert query.result().count.sum() == expected > 100
-    wp.capture_launch(graph)
-    with pytest.raises(RuntimeError, match=STALE):
-        query.result()
-    wp.capture_launch(capture(device, query))
+    replay()
+    refused(RuntimeError, STALE, query.result)
+    captured(query)()
     assert query.result().count.sum() == expected
 
 
@@ -86,39 +78,38 @@ def test_a_replay_after_arrays_were_replaced_is_refused(device, operator, pairs,
 @pytest.mark.parametrize("kind", ["count", "contacts"])
 def test_changes_of_lods(device, kind, room):
     """A graph goes on while they take no more states than there were; else an answer is right, or refused."""
-    rng, scene, refused = np.random.default_rng(5), make_scene(device), 0
+    rng, scene, lost = np.random.default_rng(5), make_scene(device), 0
     if room:
         scene.set_lods(LEVELS)
     query = OPERATORS[kind](scene, pairs=PAIRS, capacity=20_000)
-    graph = capture(device, query)
+    replay = captured(query)
     ladder = np.linspace(0, sample("torus").lod_max, 60).astype(int)
     in_room = [LEVELS - 3, np.zeros(4, int), LEVELS[::-1], np.full(4, 40), LEVELS - 9]
     for lods in [*in_room, *rng.choice(ladder, (12, 4))]:
         scene.set_lods(lods)
-        wp.capture_launch(graph)
+        replay()
         try:
             query.result()
         except RuntimeError:
-            refused += 1
-            graph = capture(device, query)
-            wp.capture_launch(graph)
+            lost += 1
+            replay = captured(query)
+            replay()
         fresh = make_scene(device)
         fresh.set_lods(lods)
         np.testing.assert_array_equal(query.result().count, fresh.intersect(PAIRS, output="count").count)
-    assert refused == 0 if room else 1 <= refused <= 4
+    assert lost == 0 if room else 1 <= lost <= 4
 
 
 def test_buffers_that_grow(device, operator):
     """The replay writes into memory that is still the graph's own, and its results are refused."""
     scene = make_scene(device)
     query = operator(scene, pairs=PAIRS[:1], capacity=8)
-    graph = capture(device, query)
+    replay = captured(query)
     query.set_pairs(PAIRS)
     expected = query.run().count
     query.launch()
-    wp.capture_launch(graph)
-    with pytest.raises(RuntimeError, match=STALE):
-        query.result()
+    replay()
+    refused(RuntimeError, STALE, query.result)
     query.launch()
     np.testing.assert_array_equal(query.result().count, expected)
 
@@ -131,7 +122,7 @@ def test_a_graph_keeps_its_arrays(device):
     """Those of the query, of the scene and of the broad phase, until the query goes."""
     scene = make_scene(device)
     query = OwnQuery(scene, "faces", capacity=8)
-    captured, states, objects = capture(device, query), query.batch.states.pool, query.batch.objects.pool
+    replay, states, objects = captured(query), query.batch.states.pool, query.batch.objects.pool
     kept = [query.hits.face, query.hits.any_hit, query.pair_poses, query.pairs, query.traversal.work.counter]
     kept += [states.node_box, states.face_corner, states.lod, objects.state, objects.rotation]
     kept += [query.broad_phase.lower, query.broad_phase.excluded, query.broad_phase.bvh, query.guard.launched]
@@ -145,10 +136,9 @@ def test_a_graph_keeps_its_arrays(device):
     del kept, states, objects
     gc.collect()
     assert all(reference() is not None for reference in alive)
-    wp.capture_launch(captured)
-    with pytest.raises(RuntimeError, match=STALE):
-        query.result()
-    del query, captured
+    replay()
+    refused(RuntimeError, STALE, query.result)
+    del query, replay
     gc.collect()
     assert not any(reference() is not None for reference in alive[:5])
 
@@ -161,8 +151,7 @@ def test_results_without_a_launch(device, operator):
         (lambda: query.resize(30_000), "buffers were replaced"),
     ):
         change()
-        with pytest.raises(RuntimeError, match=why):
-            query.result()
+        refused(RuntimeError, why, query.result)
         query.launch()
         query.result()
 
@@ -173,12 +162,10 @@ def test_a_frame_whose_buffers_grow(device):
     graph = frame.capture()
     expected = frame.run().faces
     wp.capture_launch(graph)
-    with pytest.raises(RuntimeError, match=STALE):
-        frame.result()
+    refused(RuntimeError, STALE, frame.result)
     frame.launch()
     np.testing.assert_array_equal(frame.result().faces, expected)
-    with pytest.raises(RuntimeError, match=f"a frame since the last check is lost.*{STALE}"):
-        frame.check()
+    refused(RuntimeError, f"a frame since the last check is lost.*{STALE}", frame.check)
     frame.check()
     wp.capture_launch(frame.capture())
     np.testing.assert_array_equal(frame.result().faces, expected)
@@ -188,15 +175,14 @@ def test_a_frame_whose_buffers_grow(device):
 def test_poses_of_a_graph(device):
     scene = make_scene(device)
     poses = ab.PoseInput(scene)
-    graph = capture(device, poses)
+    replay = captured(poses)
     for change in (lambda: None, lambda: scene.set_lods(LEVELS)):  # which replaces nothing that poses lie in
         change()
-        wp.capture_launch(graph)
+        replay()
         poses.check()
     scene.add(sample("torus"))
-    wp.capture_launch(graph)
-    with pytest.raises(RuntimeError, match=f"poses since the last check are lost.*{STALE}"):
-        poses.check()
+    replay()
+    refused(RuntimeError, f"poses since the last check are lost.*{STALE}", poses.check)
 
 
 def test_bodies_of_a_graph(device):
@@ -204,14 +190,13 @@ def test_bodies_of_a_graph(device):
     scene = in_a_row(device, "torus", (0, 3, 6))
     bodies = ab.Dynamics(scene, gravity=(0, 0, 0), capacity=ab.Buffers(8, pairs=1))
     bodies.step(1e-4)
-    graph = capture(device, bodies, 1e-4)
-    wp.capture_launch(graph)
+    replay = captured(bodies, 1e-4)
+    replay()
     bodies.check()
     scene.set_poses([(0.2 * k, 0, 0, 0, 0, 0, 1) for k in range(3)])
     bodies.step(1e-4)
-    wp.capture_launch(graph)
-    with pytest.raises(RuntimeError, match=STALE):
-        bodies.check()
+    replay()
+    refused(RuntimeError, STALE, bodies.check)
 
 
 CALLS = {
@@ -243,11 +228,11 @@ def test_what_waits_is_refused_in_a_capture(device, call):
     query, frame = ab.Query(scene, "count", pairs=PAIRS), ab.Pipeline(scene, output="count", pairs=PAIRS)
     expected = query.run().count
     lods = scene.lods
-    with wp.ScopedCapture(device) as captured:
+    with wp.ScopedCapture(device) as begun:
         query.launch()
         with pytest.raises(RuntimeError, match="cannot be captured in a graph; call it before the capture begins"):
             CALLS[call](scene, query, frame)
-    wp.capture_launch(captured.graph)
+    wp.capture_launch(begun.graph)
     np.testing.assert_array_equal(query.result().count, expected)
     np.testing.assert_array_equal(scene.intersect(PAIRS, output="count").count, expected)
     np.testing.assert_array_equal(scene.lods, lods)
