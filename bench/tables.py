@@ -51,6 +51,8 @@ def plain(value):
         return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None
     if value is None or isinstance(value, bool | int | str):
         return value
+    if isinstance(value, list):
+        return [plain(entry) for entry in value]
     raise TypeError(f"a row holds a {type(value).__name__}")
 
 
