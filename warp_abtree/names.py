@@ -14,8 +14,8 @@ from warp_abtree.query.request import Buffers, CapacityError
 from warp_abtree.query.result import Result
 from warp_abtree.query.stages.contacts import ContactQuery
 from warp_abtree.query.stages.distance import DistanceQuery
-from warp_abtree.query.stages.first_contact import FirstContactQuery
 from warp_abtree.query.stages.intersect import Query
+from warp_abtree.query.stages.motion import FirstContactQuery
 from warp_abtree.query.stages.points import ManifoldQuery
 from warp_abtree.scene.pipeline import Pipeline
 from warp_abtree.scene.scene import Scene

@@ -9,7 +9,8 @@ from helpers.samples import random_poses, sample
 import warp_abtree as ab
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.stage import Array, Stage
-from warp_abtree.query.stages.intersect import InsideStage, IntersectStage
+from warp_abtree.query.stages.inside import InsideStage
+from warp_abtree.query.stages.intersect import IntersectStage
 
 
 @wp.kernel

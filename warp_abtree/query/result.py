@@ -106,7 +106,7 @@ class Result(DeviceMemory):
             `query.stages.distance`; None unless output is "distance".
         time, clear, undecided: Time of first contact of each pair, float64 (p,) in [0, 1], never late and 1 where it is
             proved clear of contact, bool (p,); where undecided, bool (p,), contact may be as much later as there is
-            time. See `query.stages.first_contact`; None from other queries.
+            time. See `query.stages.motion`; None from other queries.
         node_tests, triangle_tests, float64_tests, exact_tests: Work done for each pair, int64 (p,): pairs of boxes,
             pairs of faces, those of them that float32 left uncertain, and of these those that took exact arithmetic. On
             the CPU a pair may take fewer of them after others of the same first object.

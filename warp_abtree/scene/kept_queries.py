@@ -16,8 +16,8 @@ from warp_abtree.query.request import SCENE_OPTIONS, check_options, check_within
 from warp_abtree.query.result import Result
 from warp_abtree.query.stages.contacts import ContactQuery
 from warp_abtree.query.stages.distance import DistanceQuery, check_beyond, check_distance_options
-from warp_abtree.query.stages.first_contact import FirstContactQuery
 from warp_abtree.query.stages.intersect import Query
+from warp_abtree.query.stages.motion import FirstContactQuery
 from warp_abtree.query.stages.originals import Originals
 from warp_abtree.state.work_lists import update_kernels
 

@@ -338,7 +338,7 @@ class Scene(DeviceMemory):
             device: As for `intersect`.
 
         Returns:
-            `Result` with time, clear and undecided; what they are stands in `query.stages.first_contact`.
+            `Result` with time, clear and undecided; what they are stands in `query.stages.motion`.
 
         Raises:
             ValueError: Bad pairs, poses or tolerance, a scene without objects; an object of a pair that turns by half a

@@ -17,8 +17,8 @@ from warp_abtree.kernels.base.arrays import NONE_REFUSED
 from warp_abtree.kernels.io.sweep import pose_placer, report_chunk_kernel
 from warp_abtree.query.request import MOTION_OPTIONS, SWEEP_OPTIONS, check_options, check_within, refuse_signed
 from warp_abtree.query.stages.distance import DistanceQuery, check_beyond, check_distance_options
-from warp_abtree.query.stages.first_contact import FirstContactQuery
 from warp_abtree.query.stages.intersect import Query
+from warp_abtree.query.stages.motion import FirstContactQuery
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep_poses import DeviceRows, PoseSlot, find_copy_stream, refuse_row, take_ends, take_rows
 from warp_abtree.state.arrays import ObjectArrays
@@ -287,7 +287,7 @@ def sweep(
         face of A, face of B), int32 (k, 3), sorted; with within, a structured array (p,) of any or count, and apart,
         whether the surfaces are proved farther apart. For "distance" a structured array (p,) of distance, bracket (2,),
         points (2, 3) [A's frame] and faces (2,), see `query.stages.distance`. For "first_contact" one of time,
-        clear and undecided, see `query.stages.first_contact`.
+        clear and undecided, see `query.stages.motion`.
 
     Raises:
         TypeError: model_a or model_b is no Model; an option has another name.

@@ -7,8 +7,9 @@ from warp_abtree.kernels.bodies import continuous as kernels
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.request import Buffers
 from warp_abtree.query.stage import Array, Rooms
-from warp_abtree.query.stages.first_contact import FirstContactStage
-from warp_abtree.query.stages.intersect import InsideStage, IntersectStage
+from warp_abtree.query.stages.inside import InsideStage
+from warp_abtree.query.stages.intersect import IntersectStage
+from warp_abtree.query.stages.motion import FirstContactStage
 from warp_abtree.scene.scene import Scene
 
 TIME_TOLERANCE = 2.0**-24  # of times, as a fraction of a step's motion

@@ -76,7 +76,8 @@ from warp_abtree.query.request import CapacityError, check_request
 from warp_abtree.query.result import VECTORS, Found, contact_dtypes
 from warp_abtree.query.sorting import HitSort, first_sort
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
-from warp_abtree.query.stages.intersect import ApartStage, GapStage, InsideStage, IntersectStage
+from warp_abtree.query.stages.inside import InsideStage
+from warp_abtree.query.stages.intersect import ApartStage, GapStage, IntersectStage
 from warp_abtree.query.staging import first_rows
 from warp_abtree.state.batch import Batch
 

@@ -54,7 +54,8 @@ from warp_abtree.query.operator import Operator
 from warp_abtree.query.request import check_within, refuse_signed
 from warp_abtree.query.result import DISTANCES, Found
 from warp_abtree.query.stage import Array, PairDistance, Rooms, Stage, fields
-from warp_abtree.query.stages.intersect import InsideStage, IntersectStage
+from warp_abtree.query.stages.inside import InsideStage
+from warp_abtree.query.stages.intersect import IntersectStage
 from warp_abtree.query.staging import first_rows
 
 # Pairs that make a further core worth its while, which costs some 50 us.

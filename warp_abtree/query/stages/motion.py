@@ -35,7 +35,8 @@ from warp_abtree.query.operator import Operator
 from warp_abtree.query.result import Found
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
 from warp_abtree.query.stages.distance import PAIRS_A_CORE
-from warp_abtree.query.stages.intersect import InsideStage, IntersectStage
+from warp_abtree.query.stages.inside import InsideStage
+from warp_abtree.query.stages.intersect import IntersectStage
 from warp_abtree.query.staging import first_rows
 from warp_abtree.state.poses import HostPoses, check_poses, device_rows, place_rows
 
@@ -197,7 +198,7 @@ class FirstContactStage(Stage):
 class FirstContactQuery(Operator):
     """Times of first contact of many object pairs as an operator: allocates once, launches many times.
 
-    As `Query` otherwise. What each answer is stands in `query.stages.first_contact`.
+    As `Query` otherwise. What each answer is stands in `query.stages.motion`.
 
     Args:
         scene: As for `Query`: its poses at the time of each launch are where motions start.
