@@ -80,40 +80,14 @@ class Operator(DeviceMemory):
                 batch.models.make_slabs()
         if pairs is not None:
             self.given = batch.check_pairs(pairs)
-        count = None if pairs is None else len(self.given)
-        self._distances: dict[str, PairDistance] = {}
-        for stage in stages:
-            if stage.distance is not None:
-                self._distances[stage.distance.name] = stage.distance
         self._torn = False
         self.commands = Commands()
-        self.guard = LaunchGuard(
-            self.device, batch.states.generation, batch.filter_generation if pairs is None else None
-        )
-        self.pair_batch = asked = PairBatch()
-        asked.launched = self.guard.launched
-        for stage in stages:
-            stage.attach(self)
-        # Of stages that have one, looked up once: a call of the host takes some 40 us.
-        self._searches, self._reports, self.readers, self._fitted = (
-            [getattr(stage, name) for stage in stages if getattr(type(stage), name) is not getattr(Stage, name)]
-            for name in ("search", "report", "read", "fits_states")
-        )
-        for distance in self._distances.values():
-            if distance.value is not None:
-                distance.value = distance.check(None, count)
-        if pairs is None:
-            self._excluded_count = len(batch.excluded)
-            boxes = PosedBoxes(batch)
-            for stage in stages:
-                boxes = stage.boxes(boxes)
-            self.broad_phase = BroadPhase(batch, room.pairs, sort_pairs, boxes, self.guard)
-            asked.count, asked.pairs = self.broad_phase.pair_count, self.broad_phase.pairs
-            places = len(asked.pairs)
-        else:
-            asked.count = wp.zeros(1, dtype=wp.int32, device=self.device)
-            places = max(room.pairs or 0, len(self.given))
-            check_pair_room(places)
+        filtered = batch.filter_generation if pairs is None else None
+        self.guard = LaunchGuard(self.device, batch.states.generation, filtered)
+        self.pair_batch = PairBatch()
+        self.pair_batch.launched = self.guard.launched
+        self._attach_stages()
+        places = self._find_places(room.pairs, sort_pairs)
         self.readout = Readout(self)
         uncertain = (room.uncertain or UNCERTAIN_ROOM) if self.uses_warps() else 0
         hits = (room.hits or max(1024, 16 * places)) if output == "faces" else 0
@@ -121,6 +95,35 @@ class Operator(DeviceMemory):
         self.make_room(places, hits, uncertain)
         if pairs is not None:
             self.replace_pairs(self.given)
+
+    def _attach_stages(self):
+        """Give the stages this operator, and check the distances that they were given."""
+        for stage in self.stages:
+            stage.attach(self)
+        # Of stages that have one, looked up once: a call of the host takes some 40 us.
+        self._searches, self._reports, self.readers, self._fitted = (
+            [getattr(stage, name) for stage in self.stages if getattr(type(stage), name) is not getattr(Stage, name)]
+            for name in ("search", "report", "read", "fits_states")
+        )
+        given = [stage.distance for stage in self.stages if stage.distance is not None]
+        self._distances: dict[str, PairDistance] = {distance.name: distance for distance in given}
+        for distance in given:
+            if distance.value is not None:
+                distance.value = distance.check(None, None if self.given is None else len(self.given))
+
+    def _find_places(self, room: int | None, sort_pairs: bool) -> int:
+        """Make the broad phase, unless pairs are given, and return how many pairs there is to be room for."""
+        asked, batch = self.pair_batch, self.batch
+        if self.given is not None:
+            asked.count = wp.zeros(1, dtype=wp.int32, device=self.device)
+            return max(room or 0, len(self.given))
+        self._excluded_count = len(batch.excluded)
+        boxes = PosedBoxes(batch)
+        for stage in self.stages:
+            boxes = stage.boxes(boxes)
+        self.broad_phase = BroadPhase(batch, room, sort_pairs, boxes, self.guard)
+        asked.count, asked.pairs = self.broad_phase.pair_count, self.broad_phase.pairs
+        return len(asked.pairs)
 
     @property
     def pairs(self) -> wp.array:
