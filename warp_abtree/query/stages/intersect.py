@@ -239,12 +239,6 @@ class Query(Operator):
         first = [] if within is None else [ApartStage(within)]
         return [*first, IntersectStage(output, precision), InsideStage()]
 
-    def prove_apart(self):
-        """Find alone the pairs that are not proved apart by `within`. Launches only."""
-        for stage in self.stages:
-            if isinstance(stage, ApartStage) and len(self.pairs):
-                stage.search()
-
     def set_pairs(self, pairs, within=None):
         """Query other pairs from now on, in the room there is if they fit; within None keeps the distances.
 
