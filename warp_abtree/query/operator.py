@@ -352,10 +352,7 @@ class Operator(DeviceMemory):
         return result
 
     def grow(self, between=None):
-        """Launch, and again with more room until nothing is lost. Waits for the device.
-
-        Args:
-            between: As for `launch`, which calls it once.
+        """Launch as `launch` does, and again with more room until nothing is lost. Waits for the device.
 
         Raises:
             CapacityError: More pairs or hits than there can be room for.
