@@ -42,10 +42,10 @@ def are_near(trees: Trees, pose: PairPose, gap: wp.float64, face_a: wp.int32, fa
 def part_uncertain(
     trees: Trees,
     pose: PairPose,
-    met: wp.int32,
     count: wp.int32,
     uncertain: wp.array(dtype=wp.int64),
-    apart: wp.int32,
+    met: wp.ref[wp.int32],
+    apart: wp.ref[wp.int32],
     met_inout: wp.array(dtype=wp.int64),
     apart_inout: wp.array(dtype=wp.int64),
 ):
@@ -58,7 +58,6 @@ def part_uncertain(
         else:
             apart_inout[apart] = item
             apart += 1
-    return met, apart
 
 
 @wp.func(inline=False)
