@@ -38,6 +38,14 @@ GAP_MAX_32, GAP_ROUNDING_32 = wp.constant(2.0**60), wp.constant(1.0 + 2.0**-20)
 
 
 @wp.struct
+class PairTests:
+    """Tests of one object pair."""
+
+    nodes: wp.int32  # pairs of boxes compared
+    faces: wp.int32  # pairs of faces measured
+
+
+@wp.struct
 class Hits:
     """Results of a batch of pairs. Lists are full where their total is beyond their shape, which is then the demand."""
 

@@ -87,7 +87,9 @@ def may_be_near(trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.int32
         return True
     a, b = load_points(trees, pose, pose.translation32 * scale, scale, face_a, face_b)
     # Differences of corners err by `error` along an axis.
-    return not (bound_faces(2.0 * pose.error, a, b)[0] > gap * ROUNDING_UP)
+    lower, upper = wp.float32(0.0), wp.float32(0.0)
+    bound_faces(2.0 * pose.error, a, b, lower, upper)
+    return not (lower > gap * ROUNDING_UP)
 
 
 @wp.func
