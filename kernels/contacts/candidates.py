@@ -28,20 +28,13 @@ def must_measure(chosen: wp.int32) -> bool:
 
 
 @native.func_native()
-def greatest_of_group(x: wp.float64, item: wp.int32) -> wp.vec2d:
-    """Return the greatest number of all threads, and the item of a thread that has it, the least of several."""
+def agree_on_greatest(x: wp.ref[wp.float64], item: wp.ref[wp.int32]):
+    """Take the greatest number of all threads, and the item of a thread that has it, the least of several."""
 
 
 @native.func_native()
-def rank_in_group(flag: bool) -> wp.int32:
-    """Return how many threads have set their flag, times 2^16, and how many before this one."""
-
-
-@wp.func
-def best_of_group(value: wp.float64, candidate: wp.int32):
-    """Return the candidate of the greatest value of all threads, the first of several, and that value."""
-    best = greatest_of_group(value, candidate)
-    return wp.int32(best[1]), best[0]
+def next_place_of_group(end: wp.ref[wp.int32], flag: bool) -> wp.int32:
+    """Return this thread's place in a list that ends there, of the threads whose flag is set, and move the end."""
 
 
 @wp.func
@@ -56,10 +49,9 @@ def list_candidates(first: wp.int32, end: wp.int32, curves: Curves):
         has = i < end
         if has:
             has = curves.depth[i, 0] == curves.depth[i, 0] or curves.depth[i, 1] == curves.depth[i, 1]
-        rank = rank_in_group(has)
+        place = next_place_of_group(listed, has)
         if has:
-            curves.listed[listed + (rank & 0xFFFF)] = i
-        listed += rank >> 16
+            curves.listed[place] = i
         next += group_size()
     group_sync()
     return listed
@@ -68,7 +60,7 @@ def list_candidates(first: wp.int32, end: wp.int32, curves: Curves):
 @wp.func
 def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
     """Return the deepest candidate of those listed and its depth, NO_DEPTH where there is none."""
-    deepest = NO_DEPTH
+    deepest = wp.float64(NO_DEPTH)
     best = CANDIDATES * first
     at = first + group_lane()
     while at < end:
@@ -78,7 +70,8 @@ def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
                 deepest = curves.depth[i, k]
                 best = CANDIDATES * i + k
         at += group_size()
-    return best_of_group(deepest, best)
+    agree_on_greatest(deepest, best)
+    return best, deepest
 
 
 @wp.func
@@ -96,4 +89,5 @@ def find_outermost(first: wp.int32, end: wp.int32, least: wp.float64, along: wp.
                 farthest = reach
                 best = CANDIDATES * i + k
         at += group_size()
-    return best_of_group(farthest, best)
+    agree_on_greatest(farthest, best)
+    return best, farthest

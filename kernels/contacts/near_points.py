@@ -10,7 +10,7 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, Trees, load_vertex
 from warp_abtree.kernels.base.counters import reserve_slot
-from warp_abtree.kernels.base.lanes import rank_flag, warp_any, warp_size
+from warp_abtree.kernels.base.lanes import next_place, warp_any, warp_size
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.contacts.contact import Contacts, Deferred, have_crossed
 from warp_abtree.kernels.contacts.loops import contact_key
@@ -116,14 +116,13 @@ def keep_nearest_kernel(trees: Trees, batch: PairBatch, rows: Rows, contacts: Co
     i, turn, j, p = wp.int32(-1), wp.int32(0), wp.int32(0), wp.int32(0)
     row = NearRow()
     while queue < end or warp_any(i >= 0):
-        rank = rank_flag(i < 0)
-        if i < 0 and is_nearest_only(contacts, curves_inout, queue + (rank & 0xFFFF), end):
-            i = queue + (rank & 0xFFFF)
+        next = next_place(queue, i < 0)
+        if i < 0 and is_nearest_only(contacts, curves_inout, next, end):
+            i = wp.int32(next)
             turn, j, p = wp.int32(0), i, rows.faces[i][0]
             a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
             back = wp.transpose(trees.objects.rotation[a])
             row = make_row(batch.poses[p], back, trees.objects.position[a], contacts.p0[i], contacts.p1[i])
-        queue += rank >> 16
         if i >= 0:
             found = next_neighbour(i, turn, j, rows, contacts)
             turn, j = found[0], found[1]

@@ -10,7 +10,7 @@ from warp_abtree.kernels.base.lanes import warp_any
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.contacts.candidates import (
     CANDIDATES,
-    best_of_group,
+    agree_on_greatest,
     find_deepest,
     find_outermost,
     group_lane,
@@ -154,7 +154,8 @@ def find_farthest(ends: wp.vec2i, choice: Choice, chosen: wp.array(dtype=wp.int3
                     farthest = found[k]
                     best = CANDIDATES * i + k
         base += group_size()
-    return best_of_group(farthest, best)
+    agree_on_greatest(farthest, best)
+    return best, farthest
 
 
 @wp.func

@@ -97,7 +97,8 @@ def report_waiting(
     list: wp.uint64, first: wp.int32, popped: wp.int32, trees: Trees, pair_poses: wp.array(dtype=PairPose), hits: Hits
 ):
     """Report which of the face pairs that wait are nearer than the gap, one a lane."""
-    item = read_signed_pair(list, first + wp.min(warp_lane(), popped - 1))
+    item = wp.vec3i()
+    read_signed_pair(list, first + wp.min(warp_lane(), popped - 1), item)
     p = item[0]
     near = warp_lane() < popped
     if near:
@@ -130,7 +131,7 @@ def find_near_kernel(threads: wp.int32, trees: Trees, batch: PairBatch, hits_ino
             kept = first + warp_lane() < end
             if kept:
                 kept = may_be_near(trees, batch.poses[item[0]], item[1], item[2])
-            waiting = push_signed_pair(list, waiting, kept, item, 0)
+            push_signed_pair(list, waiting, kept, item, 0)
             warp_sync()
             first += wp.min(threads, end - first)
         if waiting >= warp_size() or (first >= end and waiting > 0):

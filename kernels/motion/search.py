@@ -47,21 +47,22 @@ def advance_face_pair(
     poses: EndPoses,
     pose: PairPose,
     motion: Any,
-    best: wp.ref[FirstContact],
+    before: FirstContact,
 ):
-    """Advance the i-th face pair, which may be the earliest that meets; return how many pairs were compared."""
+    """Advance the i-th face pair; return the earliest contact so far, and how many pairs were compared."""
+    best = before
     progress = PairProgress()
     progress.time = wp.float64(read_bound(items, STACK_LENGTH + i))
     progress.mode = TO_THE_END
     if progress.time > best.time:
-        return 0
+        return best, 0
     item = read_item(items, STACK_LENGTH + i)
     faces = wp.vec2i(item_first(item), item_second(item))
     own, _ = advance_faces(tolerance, trees, poses, pose, motion, faces, progress, best.time)
     if own.end != CLEAR and (own.time < best.time or (own.time == best.time and best.end != TOUCHES)):
         # A pair that is undecided at the same time does not matter.
         best = own
-    return 1
+    return best, 1
 
 
 @wp.func
@@ -86,7 +87,8 @@ def search_contact(
     while end > 0 or waiting > 0:
         if waiting > 0:
             waiting -= 1
-            tests.faces += advance_face_pair(items, waiting, tolerance, trees, poses, pose, motions[p], best)
+            best, advanced = advance_face_pair(items, waiting, tolerance, trees, poses, pose, motions[p], best)
+            tests.faces += advanced
         else:
             end -= 1
             item, t = read_item(items, end), read_bound(items, end)

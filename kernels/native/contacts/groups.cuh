@@ -32,7 +32,7 @@ inline CUDA_CALLABLE void group_sync() {
 #endif
 }
 
-inline CUDA_CALLABLE wp::vec_t<2, wp::float64> greatest_of_group(wp::float64 x, wp::int32 item) {
+inline CUDA_CALLABLE void agree_on_greatest(wp::float64& x, wp::int32& item) {
 #if defined(__CUDA_ARCH__)
     __shared__ double values[32];
     __shared__ int items[32];
@@ -55,10 +55,10 @@ inline CUDA_CALLABLE wp::vec_t<2, wp::float64> greatest_of_group(wp::float64 x, 
         }
     }
 #endif
-    return wp::vec_t<2, wp::float64>(x, wp::float64(item));
 }
 
-inline CUDA_CALLABLE wp::int32 rank_in_group(bool flag) {
+inline CUDA_CALLABLE wp::int32 next_place_of_group(wp::int32& end, bool flag) {
+    wp::int32 place = end;
 #if defined(__CUDA_ARCH__)
     __shared__ int counts[32];
     const unsigned int votes = __ballot_sync(0xffffffffu, flag);
@@ -74,8 +74,10 @@ inline CUDA_CALLABLE wp::int32 rank_in_group(bool flag) {
             total += counts[k];
         }
     }
-    return total << 16 | before;
+    place += before;
+    end += total;
 #else
-    return flag << 16;
+    end += flag;
 #endif
+    return place;
 }

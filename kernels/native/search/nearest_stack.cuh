@@ -101,15 +101,9 @@ inline CUDA_CALLABLE void push_in_order(wp::uint64 items, wp::int32& end, wp::ve
 }
 
 inline CUDA_CALLABLE void push_open(wp::uint64 items, wp::int32& end, bool flag, wp::int64 item, wp::float32 bound) {
-#if defined(__CUDA_ARCH__)
-    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    const int at = end + __popc(votes & ((1u << threadIdx.x) - 1u)), more = __popc(votes);
-#else
-    const int at = end, more = flag;
-#endif
+    const int at = next_place(end, flag);
     if (flag) {
         *entry<volatile long long>(items, NEAREST_OPEN_START + at) = item;
         *entry<volatile float>(items, 2 * NEAREST_LENGTH + NEAREST_OPEN_START + at) = bound;
     }
-    end += more;
 }
