@@ -70,8 +70,8 @@ class FaceTests:
     """Counts of the face pair tests of an object pair."""
 
     total: wp.int64  # all of them
-    float64: wp.int64  # those that float64 decided, or should have
-    exact: wp.int64  # those that exact signs decided
+    float64: wp.int64  # those that were uncertain in float32
+    exact: wp.int64  # those that took exact signs
 
 
 @native.func_native(cpu=True)
