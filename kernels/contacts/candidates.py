@@ -28,13 +28,20 @@ def must_measure(chosen: wp.int32) -> bool:
 
 
 @native.func_native()
-def agree_on_greatest(x: wp.ref[wp.float64], item: wp.ref[wp.int32]):
-    """Take the greatest number of all threads, and the item of a thread that has it, the least of several."""
+def greatest_of_group(x: wp.float64, item: wp.int32) -> wp.vec2d:
+    """Return the greatest number of all threads, and the item of a thread that has it, the least of several."""
 
 
 @native.func_native()
 def next_place_of_group(end: wp.ref[wp.int32], flag: bool) -> wp.int32:
     """Return this thread's place in a list that ends there, of the threads whose flag is set, and move the end."""
+
+
+@wp.func
+def best_of_group(value: wp.float64, candidate: wp.int32):
+    """Return the candidate of the greatest value of all threads, the first of several, and that value."""
+    best = greatest_of_group(value, candidate)
+    return wp.int32(best[1]), best[0]
 
 
 @wp.func
@@ -60,7 +67,7 @@ def list_candidates(first: wp.int32, end: wp.int32, curves: Curves):
 @wp.func
 def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
     """Return the deepest candidate of those listed and its depth, NO_DEPTH where there is none."""
-    deepest = wp.float64(NO_DEPTH)
+    deepest = NO_DEPTH
     best = CANDIDATES * first
     at = first + group_lane()
     while at < end:
@@ -70,8 +77,7 @@ def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
                 deepest = curves.depth[i, k]
                 best = CANDIDATES * i + k
         at += group_size()
-    agree_on_greatest(deepest, best)
-    return best, deepest
+    return best_of_group(deepest, best)
 
 
 @wp.func
@@ -89,5 +95,4 @@ def find_outermost(first: wp.int32, end: wp.int32, least: wp.float64, along: wp.
                 farthest = reach
                 best = CANDIDATES * i + k
         at += group_size()
-    agree_on_greatest(farthest, best)
-    return best, farthest
+    return best_of_group(farthest, best)

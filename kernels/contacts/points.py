@@ -10,7 +10,7 @@ from warp_abtree.kernels.base.lanes import warp_any
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.contacts.candidates import (
     CANDIDATES,
-    agree_on_greatest,
+    best_of_group,
     find_deepest,
     find_outermost,
     group_lane,
@@ -154,8 +154,7 @@ def find_farthest(ends: wp.vec2i, choice: Choice, chosen: wp.array(dtype=wp.int3
                     farthest = found[k]
                     best = CANDIDATES * i + k
         base += group_size()
-    agree_on_greatest(farthest, best)
-    return best, farthest
+    return best_of_group(farthest, best)
 
 
 @wp.func

@@ -32,7 +32,7 @@ inline CUDA_CALLABLE void group_sync() {
 #endif
 }
 
-inline CUDA_CALLABLE void agree_on_greatest(wp::float64& x, wp::int32& item) {
+inline CUDA_CALLABLE wp::vec_t<2, wp::float64> greatest_of_group(wp::float64 x, wp::int32 item) {
 #if defined(__CUDA_ARCH__)
     __shared__ double values[32];
     __shared__ int items[32];
@@ -55,6 +55,7 @@ inline CUDA_CALLABLE void agree_on_greatest(wp::float64& x, wp::int32& item) {
         }
     }
 #endif
+    return wp::vec_t<2, wp::float64>(x, wp::float64(item));
 }
 
 inline CUDA_CALLABLE wp::int32 next_place_of_group(wp::int32& end, bool flag) {
