@@ -27,8 +27,8 @@ def warp_min_item(x: wp.int64) -> wp.int64: ...
 
 
 @native.func_native()
-def rank_flag(flag: bool) -> wp.int32:
-    """Return how many lanes have set their flag, and in the low half how many before this one."""
+def next_place(end: wp.ref[wp.int32], flag: bool) -> wp.int32:
+    """Return this lane's place in a list that ends there, of the lanes whose flag is set, and move the end."""
 
 
 @native.func_native()

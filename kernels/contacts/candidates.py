@@ -33,8 +33,8 @@ def greatest_of_group(x: wp.float64, item: wp.int32) -> wp.vec2d:
 
 
 @native.func_native()
-def rank_in_group(flag: bool) -> wp.int32:
-    """Return how many threads have set their flag, times 2^16, and how many before this one."""
+def next_place_of_group(end: wp.ref[wp.int32], flag: bool) -> wp.int32:
+    """Return this thread's place in a list that ends there, of the threads whose flag is set, and move the end."""
 
 
 @wp.func
@@ -56,10 +56,9 @@ def list_candidates(first: wp.int32, end: wp.int32, curves: Curves):
         has = i < end
         if has:
             has = curves.depth[i, 0] == curves.depth[i, 0] or curves.depth[i, 1] == curves.depth[i, 1]
-        rank = rank_in_group(has)
+        place = next_place_of_group(listed, has)
         if has:
-            curves.listed[listed + (rank & 0xFFFF)] = i
-        listed += rank >> 16
+            curves.listed[place] = i
         next += group_size()
     group_sync()
     return listed

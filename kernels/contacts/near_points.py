@@ -10,7 +10,7 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, Trees, load_vertex
 from warp_abtree.kernels.base.counters import reserve_slot
-from warp_abtree.kernels.base.lanes import rank_flag, warp_any, warp_size
+from warp_abtree.kernels.base.lanes import next_place, warp_any, warp_size
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.contacts.contact import Contacts, Deferred, have_crossed
 from warp_abtree.kernels.contacts.loops import contact_key
@@ -70,14 +70,14 @@ def is_nearer(trees: Trees, pose: PairPose, row: NearRow, face: wp.int32, of_fir
 
 
 @wp.func
-def next_neighbour(i: wp.int32, turn: wp.int32, before: wp.int32, rows: Rows, contacts: Contacts):
-    """Return the next contact that has a face of contact i and less separation, as (turn, place, contact).
+def next_neighbour(i: wp.int32, turn: wp.ref[wp.int32], j: wp.ref[wp.int32], rows: Rows, contacts: Contacts):
+    """Return the next contact, at place j, that has a face of contact i and less separation, -1 for no more.
 
-    Those of the first object's face come before i, turn 0, and after it, 1, those of the second's at last, 2; -1 for no
-    more. No other has a face nearer to the points of i: none of it is nearer than its separation.
+    Those of the first object's face come before i, turn 0, and after it, 1, those of the second's at last, 2. No other
+    has a face nearer to the points of i: none of it is nearer than its separation.
     """
     own = rows.faces[i]
-    p, j = own[0], before
+    p = own[0]
     while turn < 3:
         other = wp.int32(-1)
         j += wp.where(turn == 0, -1, 1)
@@ -92,8 +92,8 @@ def next_neighbour(i: wp.int32, turn: wp.int32, before: wp.int32, rows: Rows, co
                 j = wp.lower_bound(rows.key, rows.start[p], rows.start[p + 1], contact_key(p, own[2])) - 1
             turn += 1
         elif contacts.separation[other] < contacts.separation[i]:
-            return wp.vec3i(turn, j, other)
-    return wp.vec3i(turn, j, -1)
+            return other
+    return -1
 
 
 @wp.func
@@ -116,21 +116,19 @@ def keep_nearest_kernel(trees: Trees, batch: PairBatch, rows: Rows, contacts: Co
     i, turn, j, p = wp.int32(-1), wp.int32(0), wp.int32(0), wp.int32(0)
     row = NearRow()
     while queue < end or warp_any(i >= 0):
-        rank = rank_flag(i < 0)
-        if i < 0 and is_nearest_only(contacts, curves_inout, queue + (rank & 0xFFFF), end):
-            i = queue + (rank & 0xFFFF)
-            turn, j, p = wp.int32(0), i, rows.faces[i][0]
+        next = next_place(queue, i < 0)
+        if i < 0 and is_nearest_only(contacts, curves_inout, next, end):
+            i = wp.int32(next)
+            turn, j, p = wp.int32(0), wp.int32(i), rows.faces[i][0]
             a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
             back = wp.transpose(trees.objects.rotation[a])
             row = make_row(batch.poses[p], back, trees.objects.position[a], contacts.p0[i], contacts.p1[i])
-        queue += rank >> 16
         if i >= 0:
-            found = next_neighbour(i, turn, j, rows, contacts)
-            turn, j = found[0], found[1]
-            if found[2] < 0:
+            other = next_neighbour(i, turn, j, rows, contacts)
+            if other < 0:
                 i = wp.int32(-1)
             else:
-                face = rows.faces[found[2]][wp.where(turn == 2, 1, 2)]
+                face = rows.faces[other][wp.where(turn == 2, 1, 2)]
                 if is_nearer(trees, batch.poses[p], row, face, turn == 2):
                     curves_inout.depth[i, 0] = NO_POINT
                     curves_inout.depth[i, 1] = NO_POINT

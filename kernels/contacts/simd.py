@@ -4,7 +4,6 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
-from warp_abtree.kernels.base.lanes import six_numbers
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.contacts.contact import Contacts, Deferred, contact_objects
 from warp_abtree.kernels.contacts.summary import PairContacts, mean_normal, write_no_contacts
@@ -38,18 +37,32 @@ def simd_contacts(
 
 
 @native.func_native(cpu=True)
-def simd_sum_lengths(contacts: Contacts, ends: wp.vec2i) -> six_numbers:
-    """Return the length of an object pair's contacts, and how many are of faces that intersect, as `sum_lengths`."""
+def simd_sum_lengths(contacts: Contacts, ends: wp.vec2i, total: wp.ref[wp.float64], number: wp.ref[wp.float64]):
+    """Find the length of an object pair's contacts, and how many are of faces that intersect, as `sum_lengths`."""
 
 
 @native.func_native(cpu=True)
-def simd_sum_means(contacts: Contacts, ends: wp.vec2i, total: wp.float64, number: wp.float64) -> six_numbers:
-    """Return the mean point of a pair's contacts, from the first end, and the mean of normals, as `sum_means`."""
+def simd_sum_means(
+    contacts: Contacts,
+    ends: wp.vec2i,
+    total: wp.float64,
+    number: wp.float64,
+    middle: wp.ref[wp.vec3d],
+    normal: wp.ref[wp.vec3d],
+):
+    """Find the mean point of a pair's contacts, from the first end, and the mean of normals, as `sum_means`."""
 
 
 @native.func_native(cpu=True)
-def simd_sum_areas(contacts: Contacts, ends: wp.vec2i, middle: wp.vec3d, normal: wp.vec3d) -> six_numbers:
-    """Return the area within a pair's contact curve and its change, as `sum_chunks`."""
+def simd_sum_areas(
+    contacts: Contacts,
+    ends: wp.vec2i,
+    middle: wp.vec3d,
+    normal: wp.vec3d,
+    area: wp.ref[wp.float64],
+    change: wp.ref[wp.float64],
+):
+    """Find the area within a pair's contact curve and its change, as `sum_chunks`."""
 
 
 @wp.kernel
@@ -92,20 +105,22 @@ def sum_pair_kernel(
     """Sum the contacts of one object pair a thread, as the kernels of `summary` do; CPU only."""
     p = wp.tid()
     ends = wp.vec2i(start[p], start[p + 1])
-    lengths = simd_sum_lengths(contacts, ends)
-    if lengths[1] == wp.float64(0.0):
+    total, number = wp.float64(0.0), wp.float64(0.0)
+    simd_sum_lengths(contacts, ends, total, number)
+    if number == wp.float64(0.0):
         write_no_contacts(p, pair_contacts_out)
         return
-    means = simd_sum_means(contacts, ends, lengths[0], lengths[1])
-    middle = wp.vec3d(means[0], means[1], means[2])
-    n = mean_normal(trees, batch.pairs[p], wp.vec3d(means[3], means[4], means[5]))
-    areas = simd_sum_areas(contacts, ends, middle, n)
+    middle, normal = wp.vec3d(), wp.vec3d()
+    simd_sum_means(contacts, ends, total, number, middle, normal)
+    n = mean_normal(trees, batch.pairs[p], normal)
+    area, change = wp.float64(0.0), wp.float64(0.0)
+    simd_sum_areas(contacts, ends, middle, n, area, change)
     origin = contacts.p0[ends[0]]
     front, back = wp.float64(0.0), wp.float64(0.0)
-    if areas[0] == wp.float64(0.0):
+    if area == wp.float64(0.0):
         own = contact_objects(batch, p)
         span = wp.vec3i(p, ends[0], ends[1])
         front, back = reach_contacts(trees, own, batch.poses[p], span, faces, contacts, n, origin)
     pair_contacts_out.normal[p] = n
     pair_contacts_out.point[p] = origin + middle
-    pair_contacts_out.travel[p] = choose_travel(trees, batch.pairs[p], n, origin, areas[0], areas[1], front - back)
+    pair_contacts_out.travel[p] = choose_travel(trees, batch.pairs[p], n, origin, area, change, front - back)

@@ -31,8 +31,8 @@ wp.set_module_options(MODULE_OPTIONS)
 
 
 @native.func_native()
-def push_in_order(items: wp.uint64, end: wp.int32, kinds: wp.vec4i, children: four_items) -> wp.int32:
-    """Push the items that are not dropped, the first child of the first lane last; return the new end."""
+def push_in_order(items: wp.uint64, end: wp.ref[wp.int32], kinds: wp.vec4i, children: four_items):
+    """Push the items that are not dropped, the first child of the first lane last."""
 
 
 @wp.func
@@ -67,7 +67,7 @@ def search_crossing(trees: Trees, pose: PairPose, scaling: SearchScale, room: wp
         children, kinds, _bounds, _tests = bound_children(
             False, trees.states, Slabs(), pose, scaling, wp.float32(0.0), item, live
         )
-        end = push_in_order(items, end, kinds, children)
+        push_in_order(items, end, kinds, children)
         warp_sync()
     return found
 

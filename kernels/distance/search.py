@@ -39,7 +39,7 @@ from warp_abtree.kernels.distance.warp_found import (
     lower_upper,
     offer_nearest,
 )
-from warp_abtree.kernels.intersect.face_pairs import Hits
+from warp_abtree.kernels.intersect.face_pairs import Hits, PairTests
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
 from warp_abtree.kernels.search.load_balance import (
     DEPTH_FIRST_ROOM,
@@ -104,30 +104,30 @@ def bound_waiting(
     items: wp.uint64,
     first: wp.int32,
     popped: wp.int32,
-    opened: wp.int32,
+    opened: wp.ref[wp.int32],
     limit: wp.float32,
     upper: wp.float32,
     search: Search,
     trees: Trees,
     found: NearestFound,
 ):
-    """Bound face pairs in float32, one a lane; keep those that may be nearest, and return how many there are."""
+    """Bound face pairs in float32, one a lane, and keep those that may be nearest; return this lane's tests."""
     at = STACK_LENGTH + first + wp.min(warp_lane(), popped - 1)
     item = read_item(items, at)
     live = warp_lane() < popped and read_bound(items, at) <= limit
     warp_sync()
-    between = wp.vec2(wp.inf, wp.inf)
+    lower, greatest = wp.float32(wp.inf), wp.float32(wp.inf)
     if live:
         pose, scaling = search.pose, search.scaling
         face_a, face_b = item_first(item), item_second(item)
         a, b = load_points(trees, pose, scaling.translation, scaling.scale, face_a, face_b)
-        between = bound_faces(search.scaling.error, a, b)
-    least = warp_min32(between[1])
+        bound_faces(search.scaling.error, a, b, lower, greatest)
+    least = warp_min32(greatest)
     if least < upper:
         lower_upper(found.upper, search.pair, UPPER, least)
-    opened = push_open(items, opened, live and between[0] <= wp.min(least, upper), item, between[0])
+    push_open(items, opened, live and lower <= wp.min(least, upper), item, lower)
     warp_sync()
-    return opened, wp.where(live, 1, 0)
+    return wp.where(live, 1, 0)
 
 
 @wp.func
@@ -163,29 +163,27 @@ def decide_open(
 @wp.func
 def expand_nearest(
     items: wp.uint64,
-    first: wp.int32,
     popped: wp.int32,
-    waiting: wp.int32,
+    end: wp.ref[wp.int32],
+    waiting: wp.ref[wp.int32],
     limit: wp.float32,
     with_slabs: wp.bool,
     states: StatePool,
     slabs: Slabs,
     search: Search,
 ):
-    """Expand items first to first + popped, one a lane.
-
-    Returns both ends, see `push_nearest`, and how many were compared.
-    """
-    at = (first + wp.min(warp_lane(), popped - 1)) & STACK_MASK
+    """Expand so many items from the top of the stack, one a lane; return how many pairs of boxes were compared."""
+    end -= popped
+    at = (end + wp.min(warp_lane(), popped - 1)) & STACK_MASK
     item = read_item(items, at)
     live = wp.where(warp_lane() < popped and read_bound(items, at) <= limit, -1, 0)
     warp_sync()
     children, kinds, bounds, compared = bound_children(
         with_slabs, states, slabs, search.pose, search.scaling, limit, item, live
     )
-    ends = push_nearest(items, first, waiting, kinds, children, bounds)
+    push_nearest(items, end, waiting, kinds, children, bounds)
     warp_sync()
-    return ends, compared
+    return compared
 
 
 @wp.func
@@ -207,7 +205,7 @@ def search_items(
     """Search so many items of the stack, less those donated; return this lane's tests of boxes and of faces."""
     items, pair, scaling = nearest_stack(), search.pair, search.scaling
     head, end, waiting, opened = wp.int32(0), wp.int32(count), wp.int32(0), wp.int32(0)
-    tests, seen = wp.vec2i(), wp.vec2i()
+    tests, seen_items, seen_faces = PairTests(), wp.int32(0), wp.int32(0)
     has_candidate = load_faces(found.faces, pair) != NO_FACES
     # Bounds under it are of faces that are as near as is asked.
     beyond = wp.float32(load_distance(found.distance, pair) * scaling.scale64) * ROUNDING_DOWN
@@ -224,21 +222,16 @@ def search_items(
             popped = wp.min(
                 popped, wp.min(wp.where(has_candidate, warp_size(), wp.min(DIVE_ITEMS, warp_size())), end - head)
             )
-            end -= popped
-            seen[0] += popped
-            ends, compared = expand_nearest(items, end, popped, waiting, limit, with_slabs, trees.states, slabs, search)
-            end = item_second(ends)
-            waiting = item_first(ends)
-            tests[0] += compared
+            seen_items += popped
+            tests.nodes += expand_nearest(items, popped, end, waiting, limit, with_slabs, trees.states, slabs, search)
         # The first face pairs are measured at once: until then, nothing is dropped.
         if waiting >= warp_size() or (waiting > 0 and (end == head or not has_candidate)):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
-            seen[1] += popped
-            if with_slabs and not slabs_pay(seen[1], seen[0]):
+            seen_faces += popped
+            if with_slabs and not slabs_pay(seen_faces, seen_items):
                 lower_upper(found.upper, pair, SLABS_PAY, 0.0)
-            opened, measured = bound_waiting(items, waiting, popped, opened, limit, upper, search, trees, found)
-            tests[1] += measured
+            tests.faces += bound_waiting(items, waiting, popped, opened, limit, upper, search, trees, found)
         if opened > OPEN_LENGTH - warp_size() or (opened > 0 and end == head and waiting == 0):
             popped = wp.min(opened, warp_size())
             opened -= popped
@@ -303,8 +296,8 @@ def search_warp_kernel(
             search.slabs = has_mean_slabs(trees.states, slabs_inout, p)
             size = start_search_items(slot, trees.states, search.pose, work_inout)
             tests = search_items(search, size, trees, batch.poses, slabs_inout, found_inout, work_inout)
-            add_warp_sum(hits_inout.node_tests, p, tests[0])
-            add_warp_sum(hits_inout.triangle_tests, p, tests[1])
+            add_warp_sum(hits_inout.node_tests, p, tests.nodes)
+            add_warp_sum(hits_inout.triangle_tests, p, tests.faces)
         ended += 1
         p = count
         if slot < 0:

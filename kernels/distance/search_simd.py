@@ -23,7 +23,7 @@ from warp_abtree.kernels.distance.frame import (
     tolerance_terms,
 )
 from warp_abtree.kernels.distance.report import Distances, report_pair
-from warp_abtree.kernels.intersect.face_pairs import Hits
+from warp_abtree.kernels.intersect.face_pairs import Hits, PairTests
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
 from warp_abtree.kernels.search.load_balance import take_thread, take_unit
 from warp_abtree.kernels.search.mean_slabs import Slabs, count_uses, has_mean_slabs, make_due
@@ -68,11 +68,9 @@ def search_nearest(
     with_slabs: bool,
     thread: wp.int32,
     memory: wp.array2d(dtype=wp.float32),
-) -> wp.vec3i:
-    """Search until the end, or until many pairs of faces wait for float64.
-
-    Returns 1 at the end, and how many pairs of boxes were compared since the start, and pairs of faces.
-    """
+    tests: wp.ref[PairTests],
+) -> bool:
+    """Search until many pairs of faces wait for float64; return False at the end, when the tests are known."""
 
 
 @native.func_native(cpu=True)
@@ -90,11 +88,10 @@ def decide_waiting(
     pose: PairPose,
     scaling: SearchScale,
     thread: wp.int32,
-    before: Nearest,
     memory: wp.array2d(dtype=wp.float32),
+    nearest: wp.ref[Nearest],
 ):
-    """Measure in float64 the faces that wait, the nearest first, while they can improve; return the nearest."""
-    nearest = before
+    """Measure in float64 the faces that wait, the nearest first, while they can improve the nearest."""
     searching = bool(True)
     while searching:
         item = take_nearest(scaled_up(nearest.distance, scaling), thread, memory)
@@ -104,7 +101,6 @@ def decide_waiting(
             if d < nearest.distance or (d == nearest.distance and item < nearest.faces):
                 nearest.distance = d
                 nearest.faces = item
-    return nearest
 
 
 @wp.struct
@@ -155,12 +151,14 @@ def search_pair(
         thread,
         memory,
     )
-    state = wp.vec3i()
-    while state[0] == 0:
-        state = search_nearest(trees.models, trees.states, pose, scaling, terms, slabs, with_slabs, thread, memory)
-        nearest = decide_waiting(trees, pose, scaling, thread, nearest, memory)
-    hits.node_tests[p] += wp.int64(state[1])
-    hits.triangle_tests[p] += wp.int64(state[2])
+    tests, searching = PairTests(), bool(True)
+    while searching:
+        searching = search_nearest(
+            trees.models, trees.states, pose, scaling, terms, slabs, with_slabs, thread, memory, tests
+        )
+        decide_waiting(trees, pose, scaling, thread, memory, nearest)
+    hits.node_tests[p] += wp.int64(tests.nodes)
+    hits.triangle_tests[p] += wp.int64(tests.faces)
     found.distance[p] = nearest.distance
     found.faces[p] = nearest.faces
 

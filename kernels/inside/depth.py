@@ -143,9 +143,8 @@ def find_deepest_sample(
                         kinds[k] = wp.where(child.face >= 0, FACES, NODES)
                         children[k] = pack_item(wp.where(child.face >= 0, child.face, child.skip), near)
                         bounds[k] = -round_up(bound)
-            ends = push_nearest(items, end, waiting, kinds, children, bounds)
+            push_nearest(items, end, waiting, kinds, children, bounds)
             warp_sync()
-            waiting, end = item_first(ends), item_second(ends)
         if waiting >= warp_size() or (waiting > 0 and end == 0):
             popped = wp.min(waiting, warp_size())
             waiting -= popped

@@ -37,35 +37,46 @@ ITEMS_FOR_ANY = wp.constant(8)
 STACK_TO_SHUFFLE = wp.constant(CPU_STACK_LENGTH // 2)
 WAITING_LENGTH = int(FACES_READY) + 4 * ITEMS_AT_ONCE + 16  # 16 are written at a time
 
-three_numbers = wp.types.vector(length=3, dtype=wp.int64)
+
+@wp.struct
+class Descent:
+    """State of a thread's descent into an object pair."""
+
+    thread: wp.int32  # row of the memory for slabs
+    at_once: wp.int32  # items taken from the stack
+    ready: wp.int32  # leaf pairs that are tested together
+    top: wp.int32  # items on the stack
+    deep: wp.int32  # items below the floors
+    floors: wp.vec2i  # levels of the subtrees that have slabs, NO_FLOOR for none
+    tests: wp.int64  # pairs of nodes compared
+    plain_tests: wp.int64  # node pair tests after which a pair of few hits has slabs
+    looks: wp.int64  # node pair tests after which to look whether slabs are to be made
+    repeats: wp.int32  # object pairs just before this one that have its A, at most 2: slabs of A serve them all
+    cost: wp.int64  # `slab_cost`, -1 while it is not known
 
 
 @native.func_native(cpu=True)
 def descend(
     states: StatePool,
     pose: PairPose,
-    at_once: wp.int32,
-    ready: wp.int32,
     most: wp.int64,
-    top: wp.int32,
+    descent: wp.ref[Descent],
     stack: wp.array(dtype=wp.int64),
     faces: wp.array(dtype=wp.int64),
-) -> three_numbers:
+) -> wp.int32:
     """Test items from the top of a stack until there are none, or so many leaf pairs wait as are asked for.
 
     The same as `compare_node_pair`, four pairs of boxes at a time. Ends also once so many pairs of boxes were compared.
 
-    Returns the items left on the stack, the leaf pairs that wait, and the pairs of boxes compared.
+    Returns the leaf pairs that wait.
     """
 
 
 @native.func_native(cpu=True)
-def move_below(
-    floors: wp.vec2i, top: wp.int32, stack: wp.array(dtype=wp.int64), below: wp.array(dtype=wp.int64)
-) -> wp.vec2i:
-    """Move items near the top of a stack to a list if both nodes lie in subtrees whose roots are on floors.
+def move_below(descent: wp.ref[Descent], stack: wp.array(dtype=wp.int64), below: wp.array(dtype=wp.int64)):
+    """Move items near the top of a stack to an empty list if both nodes lie in subtrees whose roots are on floors.
 
-    Returns the items left on the stack, and those on the list, at most ITEMS_AT_ONCE.
+    It has at most ITEMS_AT_ONCE then.
     """
 
 
@@ -79,10 +90,10 @@ def open_subtrees(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    thread: wp.int32,
+    descent: wp.ref[Descent],
     memory: wp.array2d(dtype=wp.float32),
-) -> wp.vec2i:
-    """Choose the slab directions of an object pair; return its floors, see `move_below`.
+):
+    """Choose the slab directions of an object pair, and its floors, see `move_below`.
 
     Directions and slabs of A stay for the next pair with it, in this launch or a later one.
     """
@@ -93,16 +104,14 @@ def descend_subtrees(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    thread: wp.int32,
-    ready: wp.int32,
-    top: wp.int32,
-    stack: wp.array(dtype=wp.int64),
+    descent: wp.ref[Descent],
+    below: wp.array(dtype=wp.int64),
     memory: wp.array2d(dtype=wp.float32),
     faces: wp.array(dtype=wp.int64),
-) -> three_numbers:
+) -> wp.int32:
     """Test items below the floors until there are none, or so many leaf pairs wait as are asked for.
 
-    Returns the items left on the stack, the leaf pairs that wait, and the pairs of nodes compared.
+    Returns the leaf pairs that wait.
     """
 
 
@@ -110,22 +119,6 @@ def slab_memory_words(depth: int) -> int:
     """Return the length of a thread's memory for slabs, for trees of a depth at most."""
     slots = max(16, min(SUBTREES_KEPT, 2 ** max(0, depth - SUBTREE_DEPTH)))
     return 16 + SLAB_HEADER + slots * (2 + 32 * SUBTREE_RECORDS)
-
-
-@wp.struct
-class Descent:
-    """State of a thread's descent into an object pair."""
-
-    thread: wp.int32  # row of the memory for slabs
-    at_once: wp.int32  # items taken from the stack
-    ready: wp.int32  # leaf pairs that are tested together
-    top: wp.int32  # items on the stack
-    deep: wp.int32  # items below the floors
-    floors: wp.vec2i  # levels of the subtrees that have slabs, NO_FLOOR for none
-    plain_tests: wp.int64  # node pair tests after which a pair of few hits has slabs
-    looks: wp.int64  # node pair tests after which to look whether slabs are to be made
-    repeats: wp.int32  # object pairs just before this one that have its A, at most 2: slabs of A serve them all
-    cost: wp.int64  # `slab_cost`, -1 while it is not known
 
 
 @wp.func
@@ -139,38 +132,37 @@ def count_repeats(p: wp.int32, pair_poses: wp.array(dtype=PairPose)):
 
 
 @wp.func
-def start_descent(output: wp.int32, plain_tests: wp.int64, repeats: wp.int32, before: Descent):
-    """Return the descent from the item on the stack."""
-    descent = before
+def start_descent(output: wp.int32, plain_tests: wp.int64, repeats: wp.int32, descent: wp.ref[Descent]):
+    """Begin a descent from the item on the stack."""
     descent.at_once = wp.where(output == OUTPUT_ANY, ITEMS_FOR_ANY, ITEMS_AT_ONCE)
     descent.ready = wp.where(output == OUTPUT_ANY, FACES_FOR_ANY, FACES_READY)
     descent.top = 1
     descent.deep = 0
     descent.floors = wp.vec2i(NO_FLOOR, NO_FLOOR)
+    descent.tests = wp.int64(0)
     descent.plain_tests = plain_tests
     descent.repeats = repeats
     # An early hit ends `any`.
     descent.cost = wp.where(output == OUTPUT_ANY or repeats == 0, NEVER, wp.int64(-1))
     descent.looks = wp.where(descent.cost == NEVER, plain_tests, plain_tests / wp.int64(3))
-    return descent
 
 
 @wp.func
-def should_build_slabs(trees: Trees, pose: PairPose, hit_count: wp.int64, tested: wp.int64, before: Descent):
-    """Return whether to build slabs now, and the descent with the number of tests after which to ask again."""
-    descent = before
+def should_build_slabs(trees: Trees, pose: PairPose, hit_count: wp.int64, descent: wp.ref[Descent]):
+    """Return whether to build slabs now; else note the number of tests after which to ask again."""
+    tested = descent.tests
     if tested >= descent.plain_tests and hit_count * NODE_TESTS_A_HIT <= tested:
-        return True, descent
+        return True
     if descent.cost < wp.int64(0):
         descent.cost = slab_cost(trees.models, trees.states, pose, descent.repeats)
     if tested >= descent.cost and hit_count * NODE_TESTS_A_DENSE_HIT <= tested:
-        return True, descent
+        return True
     descent.looks = tested * wp.int64(2)
     if tested < descent.plain_tests:
         descent.looks = wp.min(descent.looks, descent.plain_tests)
     if tested < descent.cost:
         descent.looks = wp.min(descent.looks, descent.cost)
-    return False, descent
+    return False
 
 
 @wp.func
@@ -178,45 +170,29 @@ def advance(
     trees: Trees,
     pose: PairPose,
     hit_count: wp.int64,
-    tested: wp.int64,
-    before: Descent,
+    descent: wp.ref[Descent],
     stack: wp.array(dtype=wp.int64),
     below: wp.array(dtype=wp.int64),
     memory: wp.array2d(dtype=wp.float32),
     faces: wp.array(dtype=wp.int64),
 ):
-    """Descend until leaf pairs wait; return the descent then, the leaf pairs, and the node pair tests more.
-
-    Boxes decide until slabs are made; then these, below the floors.
-    """
-    descent = before
-    if descent.top > 0 and tested >= descent.looks:
-        wanted, descent = should_build_slabs(trees, pose, hit_count, tested, descent)
-        if wanted:
-            descent.floors = open_subtrees(trees.models, trees.states, pose, descent.thread, memory)
+    """Descend until leaf pairs wait; return how many. Boxes decide until slabs are made; then these, below floors."""
+    if descent.top > 0 and descent.tests >= descent.looks:
+        if should_build_slabs(trees, pose, hit_count, descent):
+            open_subtrees(trees.models, trees.states, pose, descent, memory)
             descent.looks = NEVER
     plain = descent.floors[0] == NO_FLOOR
     if not plain and descent.deep == 0:
-        moved = move_below(descent.floors, descent.top, stack, below)
-        descent.top = moved[0]
-        descent.deep = moved[1]
-    progress = three_numbers()
+        move_below(descent, stack, below)
     if descent.deep > 0:
-        progress = descend_subtrees(
-            trees.models, trees.states, pose, descent.thread, descent.ready, descent.deep, below, memory, faces
-        )
-        descent.deep = wp.int32(progress[0])
-    else:
-        most = wp.where(plain, descent.looks - tested, wp.int64(1))
-        progress = descend(trees.states, pose, descent.at_once, descent.ready, most, descent.top, stack, faces)
-        descent.top = wp.int32(progress[0])
-    return descent, wp.int32(progress[1]), progress[2]
+        return descend_subtrees(trees.models, trees.states, pose, descent, below, memory, faces)
+    most = wp.where(plain, descent.looks - descent.tests, wp.int64(1))
+    return descend(trees.states, pose, most, descent, stack, faces)
 
 
 @wp.func
-def shuffle_stack(met: wp.int32, number: wp.int64, before: Descent, stack: wp.array(dtype=wp.int64)):
+def shuffle_stack(met: wp.int32, descent: wp.ref[Descent], stack: wp.array(dtype=wp.int64)):
     """End a search that found a hit; else swap a pseudo-random item to the top, and take more at a time."""
-    descent = before
     if met > 0:
         descent.top = 0
         descent.deep = 0
@@ -224,8 +200,7 @@ def shuffle_stack(met: wp.int32, number: wp.int64, before: Descent, stack: wp.ar
     descent.ready = wp.min(2 * descent.ready, FACES_READY)
     last = descent.top - 1
     if last > 0 and last < STACK_TO_SHUFFLE:
-        at = wp.int32((number * wp.int64(40503) >> wp.int64(8)) % wp.int64(descent.top))
+        at = wp.int32((descent.tests * wp.int64(40503) >> wp.int64(8)) % wp.int64(descent.top))
         item = stack[at]
         stack[at] = stack[last]
         stack[last] = item
-    return descent

@@ -14,7 +14,7 @@ from warp_abtree.kernels.base.counters import add_warp_sum
 from warp_abtree.kernels.base.lanes import WARP_SIZE, hold_uniform, warp_any, warp_lane, warp_size, warp_sync
 from warp_abtree.kernels.base.poses import NO_NODE, PairBatch, PairPose
 from warp_abtree.kernels.exact.predicates import EXACT
-from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, Hits
+from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, Hits, TraversalTests
 from warp_abtree.kernels.intersect.leaf_pairs import separate_leaf_pairs, test_straddling
 from warp_abtree.kernels.intersect.small_trees import SmallLists, gather_leaves, is_small, test_small_trees
 from warp_abtree.kernels.search.item import compare_node_pair
@@ -39,6 +39,7 @@ from warp_abtree.kernels.search.slab_overlap import slabs_overlap
 from warp_abtree.kernels.search.warp_stack import (
     SLAB_PAIR_LENGTH,
     SLAB_PAIR_START,
+    WarpLists,
     push_children,
     push_items,
     read_item,
@@ -78,48 +79,31 @@ class Pace:
     for_any: wp.bool  # one hit ends a pair
 
 
-@wp.struct
-class WarpItems:
-    """What a warp has in shared memory: node pairs, in a ring, the oldest first."""
-
-    items: wp.uint64  # `warp_stack`
-    end: wp.int32  # node pairs
-
-
 @wp.func
-def expand_items(
-    items: wp.uint64,
-    first: wp.int32,
-    popped: wp.int32,
-    ends: wp.vec3i,
-    floor: wp.vec2i,
-    states: StatePool,
-    pose: PairPose,
-):
-    """Expand items first to first + popped, one a lane, and append what they emit; return ends and pairs compared.
+def expand_items(own: wp.ref[WarpLists], popped: wp.int32, floor: wp.vec2i, states: StatePool, pose: PairPose):
+    """Expand so many of the last items, one a lane, and append what they emit; return the pairs of boxes compared.
 
     Lanes without an item look at another's, so that none branches.
     """
     lane = warp_lane()
-    item = read_item(items, (first + wp.min(lane, popped - 1)) & STACK_MASK)
+    own.end -= popped
+    item = read_item(own.items, (own.end + wp.min(lane, popped - 1)) & STACK_MASK)
     warp_sync()
     children, lists, tests = compare_node_pair(states, pose, floor, item, wp.where(lane < popped, -1, 0))
-    found = push_children(items, ends, lists, children)
+    push_children(own, lists, children)
     warp_sync()
-    return found, tests
+    return tests
 
 
 @wp.func
-def separate_slab_pairs(
-    items: wp.uint64, first: wp.int32, popped: wp.int32, end: wp.int32, trees: Trees, pose: PairPose
-):
-    """Put the slab pairs on the stack that slabs do not separate, one a lane; return its new end."""
+def separate_slab_pairs(own: wp.ref[WarpLists], popped: wp.int32, trees: Trees, pose: PairPose):
+    """Put the slab pairs on the stack that slabs do not separate, one a lane."""
     lane = warp_lane()
-    item = read_item(items, SLAB_PAIR_START + first + wp.min(lane, popped - 1))
+    own.slab_pairs -= popped
+    item = read_item(own.items, SLAB_PAIR_START + own.slab_pairs + wp.min(lane, popped - 1))
     overlap = slabs_overlap(trees, pose, item)
-    end = push_items(items, end, overlap and lane < popped, item)
+    push_items(own.items, own.end, overlap and lane < popped, item)
     warp_sync()
-    return end
 
 
 @wp.func
@@ -138,43 +122,26 @@ def slab_floor(pose: PairPose, parts: wp.int32):
 
 
 @wp.func
-def descend_warp(
-    items: wp.uint64,
-    pace: Pace,
-    ready: wp.int32,
-    head: wp.int32,
-    ends: wp.vec3i,
-    floor: wp.vec2i,
-    trees: Trees,
-    pose: PairPose,
-):
+def descend_warp(own: wp.ref[WarpLists], pace: Pace, ready: wp.int32, floor: wp.vec2i, trees: Trees, pose: PairPose):
     """Test node pairs for a turn, or until enough slab pairs or leaf pairs wait, and then a warp of slab pairs.
 
-    Returns the new ends and the pairs of nodes compared.
+    Returns the pairs of nodes compared.
     """
-    end, slab_pairs, waiting = wp.int32(ends[0]), wp.int32(ends[1]), wp.int32(ends[2])
     ready_slab = wp.int32(ready)
     visits, node_tests = wp.int32(0), wp.int32(0)
-    while visits < pace.tests_max and end > head and slab_pairs < ready_slab and waiting < ready:
+    while visits < pace.tests_max and own.end > own.head and own.slab_pairs < ready_slab and own.leaf_pairs < ready:
         # One at a time, depth first, needs little room; more where there is. Slab pairs come back to the stack.
-        room = wp.min(pace.stack_room - DEPTH_FIRST_ROOM - (end - head), SLAB_PAIR_LENGTH) - slab_pairs
+        size = own.end - own.head
+        room = wp.min(pace.stack_room - DEPTH_FIRST_ROOM - size, SLAB_PAIR_LENGTH) - own.slab_pairs
         ready_slab = wp.min(ready, wp.max(1, room - 3))
-        popped = wp.min(wp.max(1, room >> 2), wp.min(warp_size(), end - head))
-        end -= popped
-        found, compared = expand_items(
-            items, end, popped, wp.vec3i(end, slab_pairs, waiting), floor, trees.states, pose
-        )
-        end = found[0]
-        slab_pairs = found[1]
-        waiting = found[2]
-        node_tests += compared
+        popped = wp.min(wp.max(1, room >> 2), wp.min(warp_size(), size))
+        node_tests += expand_items(own, popped, floor, trees.states, pose)
         visits += 1
-    if slab_pairs >= ready_slab or (end == head and slab_pairs > 0):
-        popped = wp.min(slab_pairs, warp_size())
-        slab_pairs -= popped
-        end = separate_slab_pairs(items, slab_pairs, popped, end, trees, pose)
+    if own.slab_pairs >= ready_slab or (own.end == own.head and own.slab_pairs > 0):
+        popped = wp.min(own.slab_pairs, warp_size())
+        separate_slab_pairs(own, popped, trees, pose)
         node_tests += wp.where(warp_lane() < popped, 1, 0)
-    return wp.vec3i(end, slab_pairs, waiting), node_tests
+    return node_tests
 
 
 @wp.func
@@ -185,20 +152,17 @@ def traverse_items(
     pair: wp.int32,
     trees: Trees,
     pose: PairPose,
-    own: WarpItems,
+    own: wp.ref[WarpLists],
     hits: Hits,
     work: Work,
 ):
-    """Traverse the stack, less the items donated; return pairs of boxes compared, and face pair tests."""
-    items, for_any = own.items, pace.for_any
-    head, ends = wp.int32(0), wp.vec3i(own.end, 0, 0)
-    node_tests, turn = wp.int32(0), wp.int32(0)
-    tested, hit_count, uncertain_count = wp.int32(0), wp.int32(0), wp.int32(0)
-    straddling = wp.int32(0)
+    """Traverse the stack, less the items donated, and count the tests of all lanes."""
+    for_any, turn, tests = pace.for_any, wp.int32(0), TraversalTests()
+    own.head = 0
     ready = wp.where(for_any, wp.min(LEAF_PAIRS_FOR_ANY, warp_size()), warp_size())
     ready_straddling = wp.where(for_any, 1, warp_size())
     floor = wp.where(for_any, wp.vec2i(NO_NODE, NO_NODE), pose.floor)
-    while ends[0] > head or ends[1] > 0 or ends[2] > 0 or straddling > 0:
+    while own.end > own.head or own.slab_pairs > 0 or own.leaf_pairs > 0 or own.straddling > 0:
         found, tickets = False, wp.int64(0)
         turn += 1
         if (turn & pace.balance_mask) == 0:
@@ -206,30 +170,30 @@ def traverse_items(
         if turn == LONG_SEARCH and for_any:
             ready = warp_size()
             floor = pose.floor
-        ends, compared = descend_warp(items, pace, ready, head, ends, floor, trees, pose)
-        node_tests += compared
-        waiting = ends[2]
-        empty = ends[0] == head and ends[1] == 0
-        if waiting >= ready or (empty and waiting > 0):
-            popped = wp.min(waiting, warp_size())
-            waiting -= popped
-            ends[2] = waiting
-            straddling = separate_leaf_pairs(mode, items, waiting, popped, straddling, trees, pose)
-            tested += popped
-        if straddling >= ready_straddling or (empty and waiting == 0 and straddling > 0):
-            popped = wp.min(straddling, warp_size())
-            straddling -= popped
-            found, uncertain = test_straddling(output, mode, items, straddling, popped, pair, trees, pose, hits)
-            hit_count += wp.where(found, 1, 0)
-            uncertain_count += wp.where(uncertain, 1, 0)
+        tests.nodes += descend_warp(own, pace, ready, floor, trees, pose)
+        empty = own.end == own.head and own.slab_pairs == 0
+        if own.leaf_pairs >= ready or (empty and own.leaf_pairs > 0):
+            popped = wp.min(own.leaf_pairs, warp_size())
+            separate_leaf_pairs(mode, own, popped, trees, pose)
+            tests.faces += popped
+        if own.straddling >= ready_straddling or (empty and own.leaf_pairs == 0 and own.straddling > 0):
+            popped = wp.min(own.straddling, warp_size())
+            found, uncertain = test_straddling(output, mode, own, popped, pair, trees, pose, hits)
+            tests.hits += wp.where(found, 1, 0)
+            tests.uncertain += wp.where(uncertain, 1, 0)
         idle = count_idle(tickets)
-        if idle > 0 and ends[0] - head >= 2 * DONATION_LEAST:
-            head = donate_items(DONATION_LEAST, pair, idle, items, head, ends[0], work)
+        if idle > 0 and own.end - own.head >= 2 * DONATION_LEAST:
+            own.head = donate_items(DONATION_LEAST, pair, idle, own.items, own.head, own.end, work)
         if for_any:
             if warp_any(found or hits.any_hit[pair] != 0):
-                ends = wp.vec3i(head, 0, 0)
-                straddling = 0
-    return node_tests, wp.vec3i(hit_count, wp.where(warp_lane() == 0, tested, 0), uncertain_count)
+                own.end = own.head
+                own.slab_pairs = 0
+                own.leaf_pairs = 0
+                own.straddling = 0
+    add_warp_sum(hits.node_tests, pair, tests.nodes)
+    add_warp_sum(hits.count, pair, tests.hits)
+    add_warp_sum(hits.triangle_tests, pair, wp.where(warp_lane() == 0, tests.faces, 0))
+    add_warp_sum(hits.float64_tests, pair, tests.uncertain)
 
 
 @wp.func
@@ -241,22 +205,6 @@ def set_pace(stack_room: wp.int32, parts: wp.int32, for_any: bool):
     # Where many warps look for one hit of a pair, each asks at every visit whether there is one.
     pace.tests_max = hold_uniform(wp.where(for_any and parts >= MANY_PARTS, 1, TESTS_A_TURN))
     return pace
-
-
-@wp.func
-def open_stack():
-    own = WarpItems()
-    own.items = warp_stack()
-    return own
-
-
-@wp.func
-def count_tests(hits: Hits, pair: wp.int32, node_tests: wp.int32, tests: wp.vec3i):
-    """Count the tests of all lanes: pairs of boxes, and the face pair tests of `traverse_items`."""
-    add_warp_sum(hits.node_tests, pair, node_tests)
-    add_warp_sum(hits.count, pair, tests[0])
-    add_warp_sum(hits.triangle_tests, pair, tests[1])
-    add_warp_sum(hits.float64_tests, pair, tests[2])
 
 
 @functools.cache
@@ -278,7 +226,8 @@ def warp_traversal(mode: int, for_any: bool):
         parts = units_of_pair(ended, count, work_inout)
         pace = set_pace(stack_room, parts, wp.static(for_any))
         asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
-        own = open_stack()
+        own = WarpLists()
+        own.items = warp_stack()
         units = count * parts
         while True:
             p = unit / parts
@@ -302,10 +251,7 @@ def warp_traversal(mode: int, for_any: bool):
             else:
                 pose.floor = slab_floor(pose, parts)
                 own.end = first_items(own.items, slot, task, pose, work_inout)
-                node_tests, tests = traverse_items(
-                    asked, wp.static(mode), pace, p, trees, pose, own, hits_inout, work_inout
-                )
-                count_tests(hits_inout, p, node_tests, tests)
+                traverse_items(asked, wp.static(mode), pace, p, trees, pose, own, hits_inout, work_inout)
             ended += 1
             unit = next_unit(ended, unit, units, work_inout)
 

@@ -38,6 +38,24 @@ GAP_MAX_32, GAP_ROUNDING_32 = wp.constant(2.0**60), wp.constant(1.0 + 2.0**-20)
 
 
 @wp.struct
+class PairTests:
+    """Tests of one object pair."""
+
+    nodes: wp.int32  # pairs of boxes compared
+    faces: wp.int32  # pairs of faces measured
+
+
+@wp.struct
+class TraversalTests:
+    """Tests of an object pair by a warp or a lane of it."""
+
+    nodes: wp.int32  # pairs of boxes compared
+    faces: wp.int32  # pairs of faces tested
+    uncertain: wp.int32  # those that are uncertain in float32
+    hits: wp.int32  # those that meet
+
+
+@wp.struct
 class Hits:
     """Results of a batch of pairs. Lists are full where their total is beyond their shape, which is then the demand."""
 

@@ -22,7 +22,14 @@ from warp_abtree.kernels.intersect.face_pairs import (
     try_straddling_faces,
 )
 from warp_abtree.kernels.search.item import item_first, item_second
-from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, STRADDLING_START, push_straddling, read_item, read_signs
+from warp_abtree.kernels.search.warp_stack import (
+    STACK_LENGTH,
+    STRADDLING_START,
+    WarpLists,
+    push_straddling,
+    read_item,
+    read_signs,
+)
 from warp_abtree.kernels.triangle.float32_filter import SEPARATED
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -31,29 +38,26 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 @wp.func
 def separate_leaf_pairs(
     mode: wp.int32,
-    items: wp.uint64,
-    first: wp.int32,
+    own: wp.ref[WarpLists],
     popped: wp.int32,
-    straddling: wp.int32,
     trees: Trees,
     pose: PairPose,
 ):
-    """Drop the leaf pairs that a plane separates, one a lane; return how many straddling pairs wait then."""
+    """Drop the leaf pairs that a plane separates, one a lane; what is left waits as straddling pairs."""
     lane = warp_lane()
-    item = read_item(items, STACK_LENGTH + first + wp.min(lane, popped - 1))
+    own.leaf_pairs -= popped
+    item = read_item(own.items, STACK_LENGTH + own.leaf_pairs + wp.min(lane, popped - 1))
     signs = face_plane_signs(mode, trees, pose, item_first(item), item_second(item))
     signs = wp.where(lane < popped, signs, SEPARATED)
-    straddling = push_straddling(items, straddling, signs != SEPARATED, item, signs)
+    push_straddling(own.items, own.straddling, signs != SEPARATED, item, signs)
     warp_sync()
-    return straddling
 
 
 @wp.func
 def test_straddling(
     output: wp.int32,
     mode: wp.int32,
-    items: wp.uint64,
-    first: wp.int32,
+    own: wp.ref[WarpLists],
     popped: wp.int32,
     pair: wp.int32,
     trees: Trees,
@@ -65,9 +69,10 @@ def test_straddling(
     With a gap pairs straddle that no plane parts by more than that, and those that are apart are listed.
     """
     lane = warp_lane()
-    at = first + wp.min(lane, popped - 1)
-    item = read_item(items, STRADDLING_START + at)
-    signs = read_signs(items, at)
+    own.straddling -= popped
+    at = own.straddling + wp.min(lane, popped - 1)
+    item = read_item(own.items, STRADDLING_START + at)
+    signs = read_signs(own.items, at)
     meet = try_straddling_faces(mode, trees, pose, item_first(item), item_second(item), signs)
     if mode == GAP:
         apart = meet == 0 and lane < popped

@@ -42,10 +42,10 @@ def are_near(trees: Trees, pose: PairPose, gap: wp.float64, face_a: wp.int32, fa
 def part_uncertain(
     trees: Trees,
     pose: PairPose,
-    met: wp.int32,
     count: wp.int32,
     uncertain: wp.array(dtype=wp.int64),
-    apart: wp.int32,
+    met: wp.ref[wp.int32],
+    apart: wp.ref[wp.int32],
     met_inout: wp.array(dtype=wp.int64),
     apart_inout: wp.array(dtype=wp.int64),
 ):
@@ -58,7 +58,6 @@ def part_uncertain(
         else:
             apart_inout[apart] = item
             apart += 1
-    return met, apart
 
 
 @wp.func(inline=False)
@@ -88,7 +87,9 @@ def may_be_near(trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.int32
         return True
     a, b = load_points(trees, pose, pose.translation32 * scale, scale, face_a, face_b)
     # Differences of corners err by `error` along an axis.
-    return not (bound_faces(2.0 * pose.error, a, b)[0] > gap * ROUNDING_UP)
+    lower, upper = wp.float32(0.0), wp.float32(0.0)
+    bound_faces(2.0 * pose.error, a, b, lower, upper)
+    return not (lower > gap * ROUNDING_UP)
 
 
 @wp.func
@@ -96,7 +97,8 @@ def report_waiting(
     list: wp.uint64, first: wp.int32, popped: wp.int32, trees: Trees, pair_poses: wp.array(dtype=PairPose), hits: Hits
 ):
     """Report which of the face pairs that wait are nearer than the gap, one a lane."""
-    item = read_signed_pair(list, first + wp.min(warp_lane(), popped - 1))
+    item = wp.vec3i()
+    read_signed_pair(list, first + wp.min(warp_lane(), popped - 1), item)
     p = item[0]
     near = warp_lane() < popped
     if near:
@@ -129,7 +131,7 @@ def find_near_kernel(threads: wp.int32, trees: Trees, batch: PairBatch, hits_ino
             kept = first + warp_lane() < end
             if kept:
                 kept = may_be_near(trees, batch.poses[item[0]], item[1], item[2])
-            waiting = push_signed_pair(list, waiting, kept, item, 0)
+            push_signed_pair(list, waiting, kept, item, 0)
             warp_sync()
             first += wp.min(threads, end - first)
         if waiting >= warp_size() or (first >= end and waiting > 0):

@@ -22,7 +22,6 @@ from warp_abtree.kernels.intersect.descent import (
     count_repeats,
     shuffle_stack,
     start_descent,
-    three_numbers,
 )
 from warp_abtree.kernels.intersect.face_pairs import (
     GAP,
@@ -55,7 +54,24 @@ MODULE_OPTIONS = native.options(
 )
 wp.set_module_options(MODULE_OPTIONS)
 
-long_counts = wp.types.vector(length=4, dtype=wp.int64)
+
+@wp.struct
+class Filtered:
+    """Face pairs of a filter, in front of a list each."""
+
+    met: wp.int32  # those that meet
+    uncertain: wp.int32  # those that another filter or exact signs decide
+    apart: wp.int32  # those that are apart, perhaps nearer than a gap
+    tested: wp.int32  # those that were looked at
+
+
+@wp.struct
+class FaceTests:
+    """Counts of the face pair tests of an object pair."""
+
+    total: wp.int64  # all of them
+    float64: wp.int64  # those that were uncertain in float32
+    exact: wp.int64  # those that took exact signs
 
 
 @native.func_native(cpu=True)
@@ -69,7 +85,8 @@ def simd_float32_filter(
     faces: wp.array(dtype=wp.int64),
     uncertain: wp.array(dtype=wp.int64),
     apart: wp.array(dtype=wp.int64),
-) -> long_counts:
+    found: wp.ref[Filtered],
+):
     """Test face pairs in float32, 16 at a time, perhaps until the first that meet. Lists have room for 16 more.
 
     The same as `float32_filter_triangles`. With a gap, 0 or more [scaled], also lists those that are apart, but for
@@ -77,9 +94,7 @@ def simd_float32_filter(
 
     Args:
         bounds: (error, unit, gap), the first two of `float32_bounds`.
-
-    Returns how many met, which stand in front of the list then, how many are uncertain, how many were tested, and how
-    many are listed as apart.
+        found: The counts then. Those that met stand in front of the list of face pairs.
     """
 
 
@@ -89,17 +104,14 @@ def simd_float64_filter(
     states: StatePool,
     pose: PairPose,
     first_ends: bool,
-    met: wp.int32,
-    waiting: wp.int32,
+    found: wp.ref[Filtered],
     uncertain: wp.array(dtype=wp.int64),
     faces: wp.array(dtype=wp.int64),
-) -> three_numbers:
+):
     """Test uncertain face pairs in float64, 8 at a time, perhaps until the first that meet, and list those that meet.
 
-    The same as `float64_filter_triangles`. The two lists differ, and have room for 8 more.
-
-    Returns how many have met then, how many are inexact, which stand in front of their list then, and how many were
-    tested.
+    The same as `float64_filter_triangles`. The two lists differ, and have room for 8 more. Those that are still
+    uncertain then are inexact, and stand in front of their list.
     """
 
 
@@ -121,15 +133,14 @@ def resolve_faces(
     output: wp.int32,
     trees: Trees,
     pose: PairPose,
-    met: wp.int32,
     waiting: wp.int32,
     faces: wp.array(dtype=wp.int64),
+    met: wp.ref[wp.int32],
     met_inout: wp.array(dtype=wp.int64),
 ):
-    """Decide face pairs one by one, perhaps until the first hit, and add hits to those on a list that have met.
+    """Decide face pairs one by one, perhaps until the first hit; add hits to a list, and return how many were decided.
 
-    Returns how many have met then, and how many were decided. Both lists may be one: what is added stands before what
-    is looked at.
+    Both lists may be one: what is added stands before what is looked at.
     """
     tested = wp.int32(0)
     for i in range(waiting):
@@ -144,7 +155,7 @@ def resolve_faces(
             if meets == 1:
                 met_inout[met] = item
                 met += 1
-    return met, tested
+    return wp.int64(tested)
 
 
 @wp.func(inline=False)
@@ -153,37 +164,30 @@ def resolve_uncertain(
     output: wp.int32,
     trees: Trees,
     pose: PairPose,
-    met: wp.int32,
-    count: wp.int32,
     uncertain: wp.array(dtype=wp.int64),
     met_inout: wp.array(dtype=wp.int64),
+    found: wp.ref[Filtered],
+    tests: wp.ref[FaceTests],
 ):
     """Decide uncertain face pairs, as `resolve_faces`: for EXACT in float64, then the inexact ones by exact signs.
 
     Not inlined: compiling takes less long, and most calls of its caller have none.
-
-    Returns how many have met then, how many were decided, and how many of these took exact signs.
     """
-    if mode != EXACT:
-        met, tested = resolve_faces(mode, output, trees, pose, met, count, uncertain, met_inout)
-        return met, tested, 0
-    counts = simd_float64_filter(
-        trees.models, trees.states, pose, output == OUTPUT_ANY, met, count, uncertain, met_inout
-    )
-    met, inexact = resolve_faces(
-        mode, output, trees, pose, wp.int32(counts[0]), wp.int32(counts[1]), uncertain, met_inout
-    )
-    return met, wp.int32(counts[2]), inexact
+    if mode == EXACT:
+        simd_float64_filter(trees.models, trees.states, pose, output == OUTPUT_ANY, found, uncertain, met_inout)
+        tests.float64 += wp.int64(found.tested)
+        tests.exact += resolve_faces(mode, output, trees, pose, found.uncertain, uncertain, found.met, met_inout)
+    else:
+        tests.float64 += resolve_faces(mode, output, trees, pose, found.uncertain, uncertain, found.met, met_inout)
 
 
 @wp.func
-def write_counts(p: wp.int32, hit_count: wp.int64, tests: long_counts, hits: Hits):
-    """Write the counts of an object pair: tests of boxes, of faces, those in float64 and those with exact signs."""
+def write_counts(p: wp.int32, hit_count: wp.int64, node_tests: wp.int64, tests: FaceTests, hits: Hits):
     hits.count[p] = hit_count
-    hits.node_tests[p] = tests[0]
-    hits.triangle_tests[p] = tests[1]
-    hits.float64_tests[p] = tests[2]
-    hits.exact_tests[p] = tests[3]
+    hits.node_tests[p] = node_tests
+    hits.triangle_tests[p] = tests.total
+    hits.float64_tests[p] = tests.float64
+    hits.exact_tests[p] = tests.exact
 
 
 @wp.func
@@ -195,28 +199,19 @@ def test_leaf_pairs(
     waiting: wp.int32,
     faces: wp.array(dtype=wp.int64),
     uncertain: wp.array(dtype=wp.int64),
+    found: wp.ref[Filtered],
+    tests: wp.ref[FaceTests],
 ):
-    """Test leaf pairs in all stages; return how many met, put in front of the list, and the counts of tests."""
+    """Test leaf pairs in all stages; those that met stand in front of the list then."""
     if mode == WITHIN:
-        near, decided = resolve_faces(mode, output, trees, pose, 0, waiting, faces, faces)
-        return near, long_counts(wp.int64(0), wp.int64(decided), wp.int64(0), wp.int64(0))
+        tests.total += resolve_faces(mode, output, trees, pose, waiting, faces, found.met, faces)
+        return
     error, unit = float32_bounds(mode, pose)
-    filtered = simd_float32_filter(
-        trees.models,
-        trees.states,
-        pose,
-        wp.vec3(error, unit, -1.0),
-        output == OUTPUT_ANY,
-        waiting,
-        faces,
-        uncertain,
-        uncertain,
-    )
-    met, count = wp.int32(filtered[0]), wp.int32(filtered[1])
-    resolved, inexact = wp.int32(0), wp.int32(0)
-    if count > 0 and not (output == OUTPUT_ANY and met > 0):
-        met, resolved, inexact = resolve_uncertain(mode, output, trees, pose, met, count, uncertain, faces)
-    return met, long_counts(wp.int64(0), filtered[2], wp.int64(resolved), wp.int64(inexact))
+    bounds, for_any = wp.vec3(error, unit, -1.0), output == OUTPUT_ANY
+    simd_float32_filter(trees.models, trees.states, pose, bounds, for_any, waiting, faces, uncertain, uncertain, found)
+    tests.total += wp.int64(found.tested)
+    if found.uncertain > 0 and not (for_any and found.met > 0):
+        resolve_uncertain(mode, output, trees, pose, uncertain, faces, found, tests)
 
 
 @wp.func
@@ -227,16 +222,17 @@ def test_gap_pairs(
     faces: wp.array(dtype=wp.int64),
     uncertain: wp.array(dtype=wp.int64),
     apart: wp.array(dtype=wp.int64),
+    found: wp.ref[Filtered],
+    tests: wp.ref[FaceTests],
 ):
-    """Test leaf pairs as `test_leaf_pairs` and list those that are apart; return how many, after how many met."""
+    """Test leaf pairs as `test_leaf_pairs` and list those that are apart."""
     error, unit = float32_bounds(EXACT, pose)
     bounds = wp.vec3(error, unit, scaled_gap(pose))
-    filtered = simd_float32_filter(trees.models, trees.states, pose, bounds, False, waiting, faces, uncertain, apart)
-    count = wp.int32(filtered[1])
-    met, clear = part_uncertain(
-        trees, pose, wp.int32(filtered[0]), count, uncertain, wp.int32(filtered[3]), faces, apart
-    )
-    return met, clear, long_counts(wp.int64(0), filtered[2], wp.int64(count), wp.int64(count))
+    simd_float32_filter(trees.models, trees.states, pose, bounds, False, waiting, faces, uncertain, apart, found)
+    part_uncertain(trees, pose, found.uncertain, uncertain, found.met, found.apart, faces, apart)
+    tests.total += wp.int64(found.tested)
+    tests.float64 += wp.int64(found.uncertain)
+    tests.exact += wp.int64(found.uncertain)
 
 
 @functools.cache
@@ -274,26 +270,22 @@ def thread_traversal(mode: int):
             stack[0] = first_item(trees.states, pose)
             slabs = descent.thread < memory_inout.shape[0] and wp.static(mode != int(WITHIN)) and pose.error < wp.inf
             plain = wp.where(slabs, wp.int64(plain_tests), NEVER)
-            descent = start_descent(output, plain, count_repeats(p, batch_inout.poses), descent)
-            hit_count, near_count, tests = wp.int64(0), wp.int64(0), long_counts()
+            start_descent(output, plain, count_repeats(p, batch_inout.poses), descent)
+            hit_count, near_count, tests = wp.int64(0), wp.int64(0), FaceTests()
             while descent.top > 0 or descent.deep > 0:
-                descent, waiting, compared = advance(
-                    trees, pose, hit_count, tests[0], descent, stack, below, memory_inout, faces
-                )
-                met, clear, stages = wp.int32(0), wp.int32(0), long_counts()
+                waiting = advance(trees, pose, hit_count, descent, stack, below, memory_inout, faces)
+                found = Filtered()
                 if wp.static(mode == int(GAP)):
-                    met, clear, stages = test_gap_pairs(trees, pose, waiting, faces, uncertain, apart)
-                    near_count += wp.int64(report_near(trees, pose, p, clear, apart, hits_inout))
+                    test_gap_pairs(trees, pose, waiting, faces, uncertain, apart, found, tests)
+                    near_count += wp.int64(report_near(trees, pose, p, found.apart, apart, hits_inout))
                 else:
-                    met, stages = test_leaf_pairs(wp.static(mode), output, trees, pose, waiting, faces, uncertain)
-                tests += stages
-                tests[0] += compared
-                if met > 0:
-                    hit_count += wp.int64(met)
-                    report_hits(output, p, pose.swapped, met, faces, hits_inout)
+                    test_leaf_pairs(wp.static(mode), output, trees, pose, waiting, faces, uncertain, found, tests)
+                if found.met > 0:
+                    hit_count += wp.int64(found.met)
+                    report_hits(output, p, pose.swapped, found.met, faces, hits_inout)
                 if output == OUTPUT_ANY:
-                    descent = shuffle_stack(met, tests[0], descent, stack)
-            write_counts(p, hit_count + near_count, tests, hits_inout)
+                    shuffle_stack(found.met, descent, stack)
+            write_counts(p, hit_count + near_count, descent.tests, tests, hits_inout)
             p = take_unit(work_inout.counter)
 
     return traverse_thread_kernel

@@ -14,7 +14,7 @@ from warp_abtree.kernels.base.lanes import (
     count_lanes,
     first_lane,
     lowest_bit,
-    rank_flag,
+    next_place,
     warp_any,
     warp_lane,
     warp_size,
@@ -23,7 +23,7 @@ from warp_abtree.kernels.base.lanes import (
 from warp_abtree.kernels.base.nodes import load_constant_node
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.exact.predicates import UNCERTAIN
-from warp_abtree.kernels.intersect.face_pairs import OUTPUT_FACES, Hits, defer_uncertain, report_hit
+from warp_abtree.kernels.intersect.face_pairs import OUTPUT_FACES, Hits, TraversalTests, defer_uncertain, report_hit
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_near
 from warp_abtree.kernels.triangle.float32_filter import (
     FLOAT32_UNIT,
@@ -162,11 +162,10 @@ def place_leaves(
         mine = at + step * warp_lane()
         leaf = pose_leaf(trees, pose, read_number(items, list + wp.min(mine, end - 1)), of_b)
         keep = mine < end and spans_overlap(leaf.posed_lower, leaf.posed_upper, root.lower, root.upper)
-        rank = rank_flag(keep)
-        row = count + (rank & 0xFFFF)
+        row = next_place(count, keep)
         place_leaf(items, row, of_b, keep and row < TILE_FACES, leaf)
         at += step * first_lane(keep and row >= TILE_FACES)
-        count = wp.min(count + (rank >> 16), TILE_FACES)
+        count = wp.min(count, TILE_FACES)
     warp_sync()
     return count, at
 
@@ -273,11 +272,11 @@ def test_overlaps(
     column: wp.int32,
     items: wp.uint64,
     hits: Hits,
+    tests: wp.ref[TraversalTests],
 ):
-    """Test the faces in place whose bits are set, and report hits; return how many met, were tested and uncertain."""
+    """Test the faces in place whose bits are set, and report and count hits."""
     bits = wp.uint32(overlaps)
     waiting, hit_end = wp.int32(0), wp.int32(0)
-    met, tested, uncertain = wp.int32(0), wp.int32(0), wp.int32(0)
     added = count_lanes(bits != wp.uint32(0))
     while added > 0 or waiting > 0 or hit_end > 0:
         while added > 0 and waiting < warp_size():
@@ -293,9 +292,9 @@ def test_overlaps(
             meet = test_faces_in_place(items, pose.error, faces, warp_lane() < popped)
             warp_sync()
             found = count_lanes(meet == 1)
-            tested += popped
-            met += found
-            uncertain += count_lanes(meet == UNCERTAIN)
+            tests.faces += popped
+            tests.hits += found
+            tests.uncertain += count_lanes(meet == UNCERTAIN)
             defer_faces(items, meet == UNCERTAIN, faces, pair, hits)
             if output == OUTPUT_FACES:
                 push_half(items, TILE_HITS + hit_end, meet == 1, faces)
@@ -309,4 +308,3 @@ def test_overlaps(
             reported = wp.min(hit_end, warp_size())
             hit_end -= reported
             report_tile_hits(items, hit_end, reported, pair, pose.swapped, hits)
-    return wp.vec3i(met, tested, uncertain)

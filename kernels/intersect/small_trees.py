@@ -10,10 +10,10 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import StatePool, Trees
-from warp_abtree.kernels.base.lanes import rank_flag, warp_any, warp_lane, warp_size, warp_sync
+from warp_abtree.kernels.base.lanes import next_place, warp_any, warp_lane, warp_size, warp_sync
 from warp_abtree.kernels.base.nodes import Node, load_constant_node
 from warp_abtree.kernels.base.poses import PairPose
-from warp_abtree.kernels.intersect.face_pairs import Hits
+from warp_abtree.kernels.intersect.face_pairs import Hits, TraversalTests
 from warp_abtree.kernels.intersect.small_tree_tiles import (
     SMALL_A,
     SMALL_B,
@@ -38,6 +38,7 @@ class SmallLists:
 
     leaves_a: wp.int32  # of A
     leaves_b: wp.int32  # of B
+    inner: wp.int32  # the inner nodes of both that were met
     fits: bool  # there was room for all of them
 
 
@@ -48,24 +49,20 @@ def is_small(pose: PairPose, faces_max: wp.int32):
 
 
 @wp.func
-def append_node(items: wp.uint64, first: wp.int32, room: wp.int32, end: wp.int32, keep: bool, entry: wp.int32):
-    """Append the entries that are to be kept to a list, as far as there is room; return its new end."""
-    rank = rank_flag(keep)
-    at = end + (rank & 0xFFFF)
+def append_node(items: wp.uint64, first: wp.int32, room: wp.int32, end: wp.ref[wp.int32], keep: bool, entry: wp.int32):
+    """Append the entries that are to be kept to a list, as far as there is room."""
+    at = next_place(end, keep)
     write_number(items, first + at, keep and at < room, entry)
-    return end + (rank >> 16)
 
 
 @wp.func
-def append_nodes(items: wp.uint64, ends: wp.vec3i, live: bool, of_b: bool, node: Node):
-    """Append nodes to the leaves of A, those of B or the inner nodes; return the new ends of these lists."""
+def append_nodes(items: wp.uint64, lists: wp.ref[SmallLists], live: bool, of_b: bool, node: Node):
+    """Append nodes to the leaves of A, those of B or the inner nodes."""
     leaf = node.face >= 0
     entry = wp.where(of_b, node.skip | SIDE_B, node.skip)
-    return wp.vec3i(
-        append_node(items, SMALL_A, SMALL_LEAVES, ends[0], live and leaf and not of_b, node.skip),
-        append_node(items, SMALL_B, SMALL_LEAVES, ends[1], live and leaf and of_b, node.skip),
-        append_node(items, 0, SMALL_INNER, ends[2], live and not leaf, entry),
-    )
+    append_node(items, SMALL_A, SMALL_LEAVES, lists.leaves_a, live and leaf and not of_b, node.skip)
+    append_node(items, SMALL_B, SMALL_LEAVES, lists.leaves_b, live and leaf and of_b, node.skip)
+    append_node(items, 0, SMALL_INNER, lists.inner, live and not leaf, entry)
 
 
 @wp.func
@@ -78,18 +75,16 @@ def level_size(faces: wp.int32):
 
 
 @wp.func
-def gather_level(items: wp.uint64, states: StatePool, pose: PairPose):
-    """List the children of the nodes of a level of both trees; return the ends of the lists."""
+def gather_level(items: wp.uint64, states: StatePool, pose: PairPose, lists: wp.ref[SmallLists]):
+    """List the children of the nodes of a level of both trees."""
     size_a, size_b = level_size(pose.faces_a), level_size(pose.faces_b)
-    ends = wp.vec3i(0, 0, 0)
     at = warp_lane()
     while at - warp_lane() < wp.max(size_a, size_b):
         node_a = load_constant_node(states, pose.node_a + size_a + wp.min(at, size_a - 1))
         node_b = load_constant_node(states, pose.node_b + size_b + wp.min(at, size_b - 1))
-        ends = append_nodes(items, ends, at < size_a and node_a.skip >= 0, False, node_a)
-        ends = append_nodes(items, ends, at < size_b and node_b.skip >= 0, True, node_b)
+        append_nodes(items, lists, at < size_a and node_a.skip >= 0, False, node_a)
+        append_nodes(items, lists, at < size_b and node_b.skip >= 0, True, node_b)
         at += warp_size()
-    return ends
 
 
 @wp.func
@@ -102,37 +97,35 @@ def gather_leaves(task: wp.vec3i, items: wp.uint64, states: StatePool, pose: Pai
     lists.fits = True
     if pose.margin < 0.0 or task[1] >= task[2]:
         return lists
-    ends = gather_level(items, states, pose)
+    gather_level(items, states, pose, lists)
     head = wp.int32(0)
-    while head < ends[2] and lists.fits:
+    while head < lists.inner and lists.fits:
         warp_sync()
-        popped = wp.min(warp_size(), ends[2] - head)
+        popped = wp.min(warp_size(), lists.inner - head)
         live = warp_lane() < popped
         entry = read_number(items, head + wp.min(warp_lane(), popped - 1))
         of_b = entry < 0
         at = wp.where(of_b, pose.node_b, pose.node_a) + 2 * (entry & INDEX_MASK)
         head += popped
-        ends = append_nodes(items, ends, live, of_b, load_constant_node(states, at))
-        ends = append_nodes(items, ends, live, of_b, load_constant_node(states, at + 1))
-        lists.fits = ends[2] <= SMALL_INNER and wp.max(ends[0], ends[1]) <= SMALL_LEAVES
-    lists.fits = lists.fits and wp.max(ends[0], ends[1]) <= SMALL_LEAVES
+        append_nodes(items, lists, live, of_b, load_constant_node(states, at))
+        append_nodes(items, lists, live, of_b, load_constant_node(states, at + 1))
+        lists.fits = lists.inner <= SMALL_INNER and wp.max(lists.leaves_a, lists.leaves_b) <= SMALL_LEAVES
+    lists.fits = lists.fits and wp.max(lists.leaves_a, lists.leaves_b) <= SMALL_LEAVES
     warp_sync()
-    lists.leaves_a = ends[0]
-    lists.leaves_b = ends[1]
     return lists
 
 
 @wp.func
-def count_small(pair: wp.int32, compared: wp.int32, tests: wp.vec3i, hits: Hits):
-    """Count pairs of boxes compared, and the face pair tests of `test_overlaps`. For one lane."""
-    if compared > 0:
-        wp.atomic_add(hits.node_tests, pair, wp.int64(compared))
-    if tests[1] > 0:
-        wp.atomic_add(hits.triangle_tests, pair, wp.int64(tests[1]))
-    if tests[0] > 0:
-        wp.atomic_add(hits.count, pair, wp.int64(tests[0]))
-    if tests[2] > 0:
-        wp.atomic_add(hits.float64_tests, pair, wp.int64(tests[2]))
+def count_small(pair: wp.int32, tests: TraversalTests, hits: Hits):
+    """Add the tests of a warp to the counts. For one lane."""
+    if tests.nodes > 0:
+        wp.atomic_add(hits.node_tests, pair, wp.int64(tests.nodes))
+    if tests.faces > 0:
+        wp.atomic_add(hits.triangle_tests, pair, wp.int64(tests.faces))
+    if tests.hits > 0:
+        wp.atomic_add(hits.count, pair, wp.int64(tests.hits))
+    if tests.uncertain > 0:
+        wp.atomic_add(hits.float64_tests, pair, wp.int64(tests.uncertain))
 
 
 @wp.func
@@ -152,7 +145,7 @@ def test_small_trees(
         for_any: One hit ends a pair.
         task: Object pair, part and parts.
     """
-    compared, tests, rows = wp.int32(0), wp.vec3i(), wp.int32(0)
+    tests, rows = TraversalTests(), wp.int32(0)
     next_a, next_b = wp.int32(task[1]), wp.int32(lists.leaves_b)
     # Tiles of A, and with each those of B, by one piece of code: what runs once waits for its instructions.
     while next_a < lists.leaves_a or next_b < lists.leaves_b:
@@ -165,11 +158,11 @@ def test_small_trees(
             column = warp_lane()
             while column - warp_lane() < count:
                 overlaps = compare_column(items, rows, column, count)
-                compared += rows * wp.min(warp_size(), count - (column - warp_lane()))
-                tests += test_overlaps(output, for_any, task[0], pose, overlaps, column, items, hits)
+                tests.nodes += rows * wp.min(warp_size(), count - (column - warp_lane()))
+                test_overlaps(output, for_any, task[0], pose, overlaps, column, items, hits, tests)
                 column += warp_size()
             if for_any:
-                if tests[0] > 0 or warp_any(hits.any_hit[task[0]] != 0):
+                if tests.hits > 0 or warp_any(hits.any_hit[task[0]] != 0):
                     next_a = lists.leaves_a
                     next_b = lists.leaves_b
         else:
@@ -177,7 +170,7 @@ def test_small_trees(
             next_b = wp.where(rows > 0, 0, lists.leaves_b)
     # What the warp writes next may be over the last tile.
     warp_sync()
-    if tests[0] > 0:
+    if tests.hits > 0:
         hits.any_hit[task[0]] = 1
     if warp_lane() == 0:
-        count_small(task[0], compared, tests, hits)
+        count_small(task[0], tests, hits)

@@ -143,12 +143,12 @@ def resolve_straddling(
 ):
     """Decide straddling pairs, one a lane, and report those that meet."""
     lane = resolve_lane()
-    waiting = read_signed_pair(list, first + wp.min(lane, popped - 1))
-    item = wp.vec3i(waiting[0], waiting[1], waiting[2])
+    item = wp.vec3i()
+    signs = read_signed_pair(list, first + wp.min(lane, popped - 1), item)
     p = item[0]
     meet = wp.int32(1)
-    if waiting[3] != SHARED_CORNER:
-        meet = intersect_straddling_item(trees, pair_poses[p], item, waiting[3])
+    if signs != SHARED_CORNER:
+        meet = intersect_straddling_item(trees, pair_poses[p], item, signs)
     list_apart_item(item, lane < popped and meet == 0, hits)
     meet = wp.where(lane < popped, meet, 0)
     warp_sync()
@@ -176,7 +176,7 @@ def float64_filter_kernel(threads: wp.int32, output: wp.int32, trees: Trees, bat
             if waits and not (output == OUTPUT_ANY and hits_inout.any_hit[item[0]] != 0):
                 signs = item_plane_signs(trees, batch.poses[item[0]], item)
             list_apart_item(item, waits and signs == SEPARATED, hits_inout)
-            straddling = push_signed_pair(list, straddling, signs >= 0, item, signs)
+            push_signed_pair(list, straddling, signs >= 0, item, signs)
             defer_inexact(hits_inout, signs == PLANES_UNDECIDED, item)
             warp_sync()
             first += wp.min(at_once * (threads / warp_size()), end - first)

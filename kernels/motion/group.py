@@ -13,7 +13,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.counters import add_warp_sum
 from warp_abtree.kernels.base.generation import STALE
-from warp_abtree.kernels.base.lanes import warp_any, warp_lane, warp_min, warp_size, warp_sync
+from warp_abtree.kernels.base.lanes import next_place, warp_any, warp_lane, warp_min, warp_size, warp_sync
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import (
@@ -68,16 +68,6 @@ def write_time(items: wp.uint64, i: wp.int32, time: wp.float64):
     """Write the time of the i-th face pair that goes on."""
 
 
-@native.func_native()
-def place_in(end: wp.int32, flag: bool) -> wp.int32:
-    """Return the place of this lane's entry in a list that ends there, of the lanes whose flag is set."""
-
-
-@native.func_native()
-def end_after(end: wp.int32, flag: bool) -> wp.int32:
-    """Return the end of such a list after that."""
-
-
 @wp.struct
 class Group:
     """Object pairs that a warp searches, a slot each."""
@@ -97,12 +87,10 @@ def time_of(group: Group, slot: wp.int32):
 
 
 @wp.func
-def count_in(counts: wp.vec4i, slot: wp.int32, more: wp.int32):
-    """Return counts with more in a slot."""
-    sums = counts
+def count_in(counts: wp.ref[wp.vec4i], slot: wp.int32, more: wp.int32):
+    """Count more in a slot."""
     for k in range(4):
-        sums[k] += wp.where(slot == k, more, 0)
-    return sums
+        counts[k] += wp.where(slot == k, more, 0)
 
 
 @wp.func
@@ -128,31 +116,27 @@ def push_steps(
         children[j] = wp.where(turn, c, d)
         kinds[i] = wp.where(turn, m, k)
         kinds[j] = wp.where(turn, k, m)
-    end, waiting = ends[0], ends[1]
+    end, waiting = wp.int32(ends[0]), wp.int32(ends[1])
     for k in range(4):
         node, face = kinds[k] == NODES, kinds[k] == FACES
-        place, face_place = place_in(end, node), MOTION_STACK_LENGTH + place_in(waiting, face)
+        place, face_place = next_place(end, node), MOTION_STACK_LENGTH + next_place(waiting, face)
         if node or face:
             write_entry(items, wp.where(node, place, face_place), children[k], times[k], slot)
-        end = end_after(end, node)
-        waiting = end_after(waiting, face)
     return wp.vec2i(end, waiting)
 
 
 @wp.func
-def take_contacts(group: Group, slot: wp.int32, own: FirstContact):
-    """Return a group with the earliest of the contacts of all lanes."""
-    found = group
+def take_contacts(group: wp.ref[Group], slot: wp.int32, own: FirstContact):
+    """Take the earliest of the contacts of all lanes."""
     time = wp.where(own.end == CLEAR or own.end == IN_PROGRESS, wp.float64(wp.inf), own.time)
     for k in range(4):
         mine = slot == k
         earliest = warp_min(wp.where(mine, time, wp.float64(wp.inf)))
-        if earliest < found.time[k] or (earliest == found.time[k] and found.end[k] != TOUCHES):
+        if earliest < group.time[k] or (earliest == group.time[k] and group.end[k] != TOUCHES):
             # A pair that is undecided at the same time does not matter.
             touches = warp_any(mine and time == earliest and own.end == TOUCHES)
-            found.time[k] = earliest
-            found.end[k] = wp.where(touches, TOUCHES, UNDECIDED)
-    return found
+            group.time[k] = earliest
+            group.end[k] = wp.where(touches, TOUCHES, UNDECIDED)
 
 
 @wp.func
@@ -173,7 +157,7 @@ def advance_face_pairs(
         mode: ONE_STEP for those that go on, NORMALS for those that wait.
     """
     group = before
-    waiting, going = ends[1], ends[2]
+    waiting, going = wp.int32(ends[1]), wp.int32(ends[2])
     popped = wp.min(wp.where(mode == ONE_STEP, going, waiting), warp_size())
     lane = wp.min(warp_lane(), popped - 1)
     progress = PairProgress()
@@ -197,14 +181,13 @@ def advance_face_pairs(
         p = group.first + slot
         faces = wp.vec2i(item_first(item), item_second(item))
         own, steps = advance_faces(tolerance, trees, poses, pair_poses[p], motion[p], faces, progress, best)
-    group.faces = count_in(group.faces, slot, wp.where(live and mode != ONE_STEP, 1, 0))
-    group = take_contacts(group, slot, own)
+    count_in(group.faces, slot, wp.where(live and mode != ONE_STEP, 1, 0))
+    take_contacts(group, slot, own)
     goes_on = own.end == IN_PROGRESS and own.time <= time_of(group, slot)
-    place = place_in(going, goes_on)
+    place = next_place(going, goes_on)
     if goes_on:
         write_entry(items, GOING_START + place, item, wp.float32(steps), slot)
         write_time(items, place, own.time)
-    going = end_after(going, goes_on)
     warp_sync()
     return group, wp.vec3i(ends[0], waiting, going)
 
@@ -269,7 +252,7 @@ def search_group(
             pushed = push_steps(items, wp.vec2i(end, ends[1]), slot, kinds, children, times)
             warp_sync()
             ends = wp.vec3i(pushed[0], pushed[1], ends[2])
-            group.nodes = count_in(group.nodes, slot, compared)
+            count_in(group.nodes, slot, compared)
         mode = wp.where(ends[2] >= warp_size() or ends[1] == 0, ONE_STEP, NORMALS)
         most = wp.where(mode == ONE_STEP, ends[2], ends[1])
         if most >= warp_size() or (ends[0] == 0 and most > 0):

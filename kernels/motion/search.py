@@ -14,7 +14,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
-from warp_abtree.kernels.intersect.face_pairs import Hits
+from warp_abtree.kernels.intersect.face_pairs import Hits, PairTests
 from warp_abtree.kernels.motion.face_pair import CLEAR, TO_THE_END, TOUCHES, FirstContact, PairProgress
 from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
 from warp_abtree.kernels.motion.linear import EndPoses
@@ -83,21 +83,19 @@ def search_contact(
     write_item(items, 0, first_item(trees.states, pose))
     write_bound(items, 0, wp.float32(start))
     end, waiting = wp.int32(1), wp.int32(0)
-    tests = wp.vec2i()
+    tests = PairTests()
     while end > 0 or waiting > 0:
         if waiting > 0:
             waiting -= 1
             best, advanced = advance_face_pair(items, waiting, tolerance, trees, poses, pose, motions[p], best)
-            tests[1] += advanced
+            tests.faces += advanced
         else:
             end -= 1
             item, t = read_item(items, end), read_bound(items, end)
             if wp.float64(t) <= best.time:
                 children, kinds, times, compared = advance_nodes(trees.states, pose, motions[p], t, best.time, item, -1)
-                ends = push_nearest(items, end, waiting, kinds, children, times)
-                end = item_second(ends)
-                waiting = item_first(ends)
-                tests[0] += compared
+                push_nearest(items, end, waiting, kinds, children, times)
+                tests.nodes += compared
     return best, tests
 
 
@@ -131,8 +129,8 @@ def thread_search(kind):
                 contact, tests = search_contact(items, tolerance, trees, poses, pose, motion, p, start)
                 contacts_inout.time[p] = contact.time
                 contacts_inout.end[p] = contact.end
-                hits_inout.node_tests[p] += wp.int64(tests[0])
-                hits_inout.triangle_tests[p] += wp.int64(tests[1])
+                hits_inout.node_tests[p] += wp.int64(tests.nodes)
+                hits_inout.triangle_tests[p] += wp.int64(tests.faces)
             p = take_unit(contacts_inout.counter)
 
     return search_thread_kernel

@@ -31,9 +31,15 @@ BEYOND = wp.constant(wp.float64(2.0**-50))
 
 @native.func_native()
 def apart_until(
-    starts: words_type, ends: words_type, away: wp.vec3d, error: wp.float64, start: wp.float64, limit: wp.float64
-) -> wp.vec2d:
-    """Return the time until which faces stay apart, up to a limit, and the outcome: CLEAR, TOUCHES or UNDECIDED.
+    starts: words_type,
+    ends: words_type,
+    away: wp.vec3d,
+    error: wp.float64,
+    start: wp.float64,
+    limit: wp.float64,
+    contact: wp.ref[FirstContact],
+):
+    """Find the time until which faces stay apart, up to a limit, and the outcome: CLEAR, TOUCHES or UNDECIDED.
 
     Args:
         starts, ends: Where corners are at first and at last, in any frame.
@@ -81,8 +87,6 @@ def resolve_in_double_words(
         b = wp.matrix_from_rows(rounded(starts[3]), rounded(starts[4]), rounded(starts[5]))
         # A unit vector has a coordinate over a half, and 8 sizes along it are farther than boxes reach.
         away = wp.float64(16.0) * size * separating_direction(a, b)
-    found = apart_until(starts, ends, away, error, start, wp.min(best + BEYOND, wp.float64(1.0)))
     contact = FirstContact()
-    contact.time = found[0]
-    contact.end = wp.int32(found[1])
+    apart_until(starts, ends, away, error, start, wp.min(best + BEYOND, wp.float64(1.0)), contact)
     return contact

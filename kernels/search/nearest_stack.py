@@ -29,14 +29,16 @@ def write_bound(items: wp.uint64, i: wp.int32, bound: wp.float32): ...
 
 @native.func_native()
 def push_nearest(
-    items: wp.uint64, end: wp.int32, leaf_end: wp.int32, kinds: wp.vec4i, children: four_items, bounds: wp.vec4
-) -> wp.int64:
-    """Append node pairs to the stack, the nearest of each lane last, and face pairs to theirs.
-
-    Returns both ends as an item, that of the face pairs first.
-    """
+    items: wp.uint64,
+    end: wp.ref[wp.int32],
+    leaf_end: wp.ref[wp.int32],
+    kinds: wp.vec4i,
+    children: four_items,
+    bounds: wp.vec4,
+):
+    """Append node pairs to the stack, the nearest of each lane last, and face pairs to theirs."""
 
 
 @native.func_native()
-def push_open(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64, bound: wp.float32) -> wp.int32:
-    """Append the face pairs whose flag is set to those for float64; return the new end."""
+def push_open(items: wp.uint64, end: wp.ref[wp.int32], flag: bool, item: wp.int64, bound: wp.float32):
+    """Append the face pairs whose flag is set to those for float64."""

@@ -32,22 +32,31 @@ def read_item(items: wp.uint64, i: wp.int32) -> wp.int64: ...
 def write_item(items: wp.uint64, i: wp.int32, item: wp.int64): ...
 
 
+@wp.struct
+class WarpLists:
+    """What a warp has in shared memory: node pairs, in a ring, the oldest first, and what follows from them."""
+
+    items: wp.uint64  # `warp_stack`
+    head: wp.int32  # node pairs that were taken from the ring's other end
+    end: wp.int32  # node pairs, with these
+    slab_pairs: wp.int32  # node pairs that slabs are to decide
+    leaf_pairs: wp.int32  # pairs of faces that planes are to decide
+    straddling: wp.int32  # pairs of faces that edges are to decide
+
+
 @native.func_native()
-def push_children(items: wp.uint64, ends: wp.vec3i, lists: wp.vec4i, children: four_items) -> wp.vec3i:
-    """Append children to the lists that they are for, if any, see `node_pair`.
-
-    Returns the new ends of the stack, the slab pairs and the leaf pairs.
-    """
+def push_children(own: wp.ref[WarpLists], lists: wp.vec4i, children: four_items):
+    """Append children to the lists that they are for, if any, see `node_pair`."""
 
 
 @native.func_native()
-def push_items(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64) -> wp.int32:
-    """Append the items whose flag is set to the stack; return its new end."""
+def push_items(items: wp.uint64, end: wp.ref[wp.int32], flag: bool, item: wp.int64):
+    """Append the items whose flag is set to the stack."""
 
 
 @native.func_native()
-def push_straddling(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64, signs: wp.int32) -> wp.int32:
-    """Append the leaf pairs whose flag is set, with their signs, to the straddling pairs; return the new end."""
+def push_straddling(items: wp.uint64, end: wp.ref[wp.int32], flag: bool, item: wp.int64, signs: wp.int32):
+    """Append the leaf pairs whose flag is set, with their signs, to the straddling pairs."""
 
 
 @native.func_native()
@@ -61,10 +70,10 @@ def signed_pairs() -> wp.uint64:
 
 
 @native.func_native()
-def push_signed_pair(list: wp.uint64, end: wp.int32, flag: bool, item: wp.vec3i, signs: wp.int32) -> wp.int32:
-    """Append the face pairs whose flag is set, with their signs, to a list; return the new end."""
+def push_signed_pair(list: wp.uint64, end: wp.ref[wp.int32], flag: bool, item: wp.vec3i, signs: wp.int32):
+    """Append the face pairs whose flag is set, with their signs, to a list."""
 
 
 @native.func_native()
-def read_signed_pair(list: wp.uint64, i: wp.int32) -> wp.vec4i:
-    """Return the i-th face pair of a list, and its signs."""
+def read_signed_pair(list: wp.uint64, i: wp.int32, item: wp.ref[wp.vec3i]) -> wp.int32:
+    """Read the i-th face pair of a list; return its signs."""

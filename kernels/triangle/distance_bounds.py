@@ -14,8 +14,10 @@ three_points = wp.types.matrix(shape=(3, 3), dtype=wp.float32)
 
 
 @native.func_native()
-def bound_faces(own: wp.float32, a: three_points, b: three_points) -> wp.vec2:
-    """Return a lower and an upper bound of the distance of two triangles, their corners in rows.
+def bound_faces(
+    own: wp.float32, a: three_points, b: three_points, lower: wp.ref[wp.float32], upper: wp.ref[wp.float32]
+):
+    """Find a lower and an upper bound of the distance of two triangles, their corners in rows.
 
     Args:
         own: What errors of the coordinates add.

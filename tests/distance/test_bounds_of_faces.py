@@ -54,9 +54,7 @@ def bound_faces_kernel(corners: wp.array2d[wp.vec3], bounds_out: wp.array2d[wp.f
     for k in range(3):
         a[k] = corners[i, k]
         b[k] = corners[i, 3 + k]
-    bounds = bound_faces(0.0, a, b)
-    bounds_out[i, 0] = bounds[0]
-    bounds_out[i, 1] = bounds[1]
+    bound_faces(0.0, a, b, bounds_out[i, 0], bounds_out[i, 1])
 
 
 def test_bounds_of_faces_cover_roundings_that_add_up(device):

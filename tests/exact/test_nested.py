@@ -16,6 +16,7 @@ from warp_abtree.kernels.intersect import descent
 from warp_abtree.kernels.intersect.descent import (
     CPU_STACK_LENGTH,
     WAITING_LENGTH,
+    Descent,
     descend_subtrees,
     open_subtrees,
     slab_memory_words,
@@ -139,13 +140,13 @@ def list_leaf_pairs_kernel(
     """Note which faces of one number are a leaf pair that slabs do not separate, from the roots on."""
     pose = pair_poses[0]
     pose.margin = pose.margin * margin_factor
-    open_subtrees(models, states, pose, 0, memory)
+    state = Descent()
+    state.ready = AT_ONCE
+    state.deep = 1
+    open_subtrees(models, states, pose, state, memory)
     stack_inout[0] = first_item(states, pose)
-    top = wp.int32(1)
-    while top > 0:
-        progress = descend_subtrees(models, states, pose, 0, AT_ONCE, top, stack_inout, memory, faces_inout)
-        top = wp.int32(progress[0])
-        for i in range(wp.int32(progress[1])):
+    while state.deep > 0:
+        for i in range(descend_subtrees(models, states, pose, state, stack_inout, memory, faces_inout)):
             if item_first(faces_inout[i]) == item_second(faces_inout[i]):
                 met_out[item_first(faces_inout[i])] = 1
 

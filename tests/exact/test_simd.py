@@ -10,13 +10,13 @@ from helpers.samples import STILL, contact_poses, sample
 
 from warp_abtree import testing
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.exact.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.intersect import descent, face_pairs
 from warp_abtree.kernels.intersect.descent import CPU_STACK_LENGTH, ITEMS_AT_ONCE, WAITING_LENGTH
 from warp_abtree.kernels.intersect.face_pairs import face_plane_signs, intersect_straddling_faces
-from warp_abtree.kernels.intersect.simd import simd_float32_filter, simd_float64_filter
+from warp_abtree.kernels.intersect.simd import Filtered, simd_float32_filter, simd_float64_filter
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, SEPARATED
 
@@ -39,17 +39,18 @@ Items = wp.array[wp.int64]
 
 @wp.struct
 class Posed:
-    models: ModelPool  # vertices of both
-    states: StatePool  # faces of both
+    trees: Trees  # vertices and faces of both
     pose: PairPose  # of B in A's frame
 
 
 def posed_faces(field, points, corners, **pose):
     """Return faces between points, which a field of the models holds, with fields of a pose."""
     made = Posed()
-    setattr(made.models, field, wp.array(points, dtype=wp.vec4 if field == "vertex_near" else wp.vec4d, device=CPU))
+    setattr(
+        made.trees.models, field, wp.array(points, dtype=wp.vec4 if field == "vertex_near" else wp.vec4d, device=CPU)
+    )
     corners = np.pad(corners, ((0, 0), (0, 1))).astype(np.int32)
-    made.states.face_corner = wp.array(corners, dtype=wp.vec4i, device=CPU)
+    made.trees.states.face_corner = wp.array(corners, dtype=wp.vec4i, device=CPU)
     for name, value in pose.items():
         setattr(made.pose, name, value)
     return made
@@ -78,19 +79,24 @@ def ask_at_once(kernel, *inputs):
 def float32_one_kernel(mode: int, posed: Posed, items: Items, meet_out: wp.array2d[int]):
     i = wp.tid()
     a, b = item_first(items[i]), item_second(items[i])
-    signs = face_plane_signs(mode, posed.models, posed.states, posed.pose, a, b)
-    meet = intersect_straddling_faces(mode, posed.models, posed.states, posed.pose, a, b, signs)
+    signs = face_plane_signs(mode, posed.trees, posed.pose, a, b)
+    meet = intersect_straddling_faces(mode, posed.trees, posed.pose, a, b, signs)
     meet_out[0, i] = wp.where(signs == SEPARATED, 0, meet)
+
+
+@wp.func
+def write_filtered(found: Filtered, count: Items):
+    count[0] = wp.int64(found.met)
+    count[1] = wp.int64(found.uncertain)
+    count[2] = wp.int64(found.tested)
 
 
 @wp.kernel
 def float32_all_kernel(first_ends: bool, unit: float, posed: Posed, faces_inout: Items, left_out: Items, count: Items):
-    models, states, pose, waiting = posed.models, posed.states, posed.pose, faces_inout.shape[0] - OVER
-    counts = simd_float32_filter(
-        models, states, pose, wp.vec3(pose.error, unit, -1.0), first_ends, waiting, faces_inout, left_out, left_out
-    )
-    for i in range(3):
-        count[i] = counts[i]
+    models, states, pose, waiting = posed.trees.models, posed.trees.states, posed.pose, faces_inout.shape[0] - OVER
+    bounds, found = wp.vec3(pose.error, unit, -1.0), Filtered()
+    simd_float32_filter(models, states, pose, bounds, first_ends, waiting, faces_inout, left_out, left_out, found)
+    write_filtered(found, count)
 
 
 def near_points(kind, rng, count):
@@ -142,16 +148,18 @@ def test_float32_filter_is_the_same_as_one_by_one(kind, posed):
 def float64_one_kernel(posed: Posed, items: Items, meet_out: wp.array2d[int]):
     i = wp.tid()
     a, b = item_first(items[i]), item_second(items[i])
-    meet_out[0, i] = face_pairs.test_faces(FILTER, posed.models, posed.states, posed.pose, a, b)
-    meet_out[1, i] = face_pairs.test_faces(EXACT, posed.models, posed.states, posed.pose, a, b)
+    meet_out[0, i] = face_pairs.test_faces(FILTER, posed.trees, posed.pose, a, b)
+    meet_out[1, i] = face_pairs.test_faces(EXACT, posed.trees, posed.pose, a, b)
 
 
 @wp.kernel
 def float64_all_kernel(first_ends: bool, met: int, waiting: int, posed: Posed, left: Items, faces: Items, count: Items):
-    models, states, pose = posed.models, posed.states, posed.pose
-    counts = simd_float64_filter(models, states, pose, first_ends, met, waiting, left, faces)
-    for i in range(3):
-        count[i] = counts[i]
+    models, states, pose = posed.trees.models, posed.trees.states, posed.pose
+    found = Filtered()
+    found.met = met
+    found.uncertain = waiting
+    simd_float64_filter(models, states, pose, first_ends, found, left, faces)
+    write_filtered(found, count)
 
 
 def exact_points(kind, rng, count):
@@ -249,14 +257,16 @@ def descend_kernel(
     root = first_item(states, pose[0])
     for i in range(how[0]):
         stack[i] = root
-    top = wp.int32(how[0])
-    while top > 0:
-        progress = descent.descend(states, pose[0], how[1], how[2], descent.NEVER, top, stack, faces)
-        top = wp.int32(progress[0])
-        counts[1] = counts[1] + progress[2]
-        for i in range(wp.int32(progress[1])):
+    state = descent.Descent()
+    state.top = how[0]
+    state.at_once = how[1]
+    state.ready = how[2]
+    while state.top > 0:
+        waiting = descent.descend(states, pose[0], descent.NEVER, state, stack, faces)
+        for i in range(waiting):
             found[wp.int32(counts[0]) + i] = faces[i]
-        counts[0] = counts[0] + progress[1]
+        counts[0] = counts[0] + wp.int64(waiting)
+    counts[1] = state.tests
 
 
 @pytest.mark.parametrize("names", [("torus", "torus"), ("soup", "torus"), ("torus", "soup")], ids="-".join)

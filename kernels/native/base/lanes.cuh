@@ -117,13 +117,16 @@ inline CUDA_CALLABLE wp::float32 warp_min32(wp::float32 x) {
     return x;
 }
 
-inline CUDA_CALLABLE wp::int32 rank_flag(bool flag) {
+inline CUDA_CALLABLE wp::int32 next_place(wp::int32& end, bool flag) {
+    wp::int32 place = end;
 #if defined(__CUDA_ARCH__)
     const unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    return __popc(votes) << 16 | __popc(votes & ((1u << threadIdx.x) - 1u));
+    place += __popc(votes & ((1u << threadIdx.x) - 1u));
+    end += __popc(votes);
 #else
-    return flag << 16;
+    end += flag;
 #endif
+    return place;
 }
 
 inline CUDA_CALLABLE wp::int32 count_lanes(bool flag) {

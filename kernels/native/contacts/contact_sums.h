@@ -5,9 +5,9 @@
 #include "contacts/contact64.h"
 
 template <class Contacts>
-wp::vec_t<6, wp::float64> simd_sum_lengths(const Contacts& contacts, wp::vec_t<2, wp::int32> ends) {
+void simd_sum_lengths(const Contacts& contacts, wp::vec_t<2, wp::int32> ends, wp::float64& total, wp::float64& number) {
 #pragma clang fp contract(off)
-    wp::vec_t<6, wp::float64> result;
+    wp::float64 all[2] = {};
     typedef Contact64 C;
     C::lanes length, crossed;
     double sum[2] = {};
@@ -22,18 +22,19 @@ wp::vec_t<6, wp::float64> simd_sum_lengths(const Contacts& contacts, wp::vec_t<2
         }
         if ((i + count - ends[0]) % CHUNK == 0 || i + count == ends[1])
             for (int c = 0; c < 2; ++c) {
-                result[c] += sum[c];
+                all[c] += sum[c];
                 sum[c] = 0.0;
             }
     }
-    return result;
+    total = all[0];
+    number = all[1];
 }
 
 template <class Contacts>
-wp::vec_t<6, wp::float64> simd_sum_means(const Contacts& contacts, wp::vec_t<2, wp::int32> ends, wp::float64 total,
-                                         wp::float64 number) {
+void simd_sum_means(const Contacts& contacts, wp::vec_t<2, wp::int32> ends, wp::float64 total, wp::float64 number,
+                    wp::vec_t<3, wp::float64>& middle, wp::vec_t<3, wp::float64>& normal) {
 #pragma clang fp contract(off)
-    wp::vec_t<6, wp::float64> result;
+    wp::float64 all[6] = {};
     typedef Contact64 C;
     typedef C::Point Point;
     const wp::vec_t<3, wp::float64> first = contacts.p0.data[ends[0]];
@@ -45,7 +46,7 @@ wp::vec_t<6, wp::float64> simd_sum_means(const Contacts& contacts, wp::vec_t<2, 
         C::load_crossed(contacts.separation.data, contacts.separation.shape[0] != 0, i, count, crossed);
         const Point p0 = C::load((const double*)(contacts.p0.data + i), count);
         const Point p1 = C::load((const double*)(contacts.p1.data + i), count);
-        const Point normal = C::load((const double*)(contacts.normal.data + i), count);
+        const Point n = C::load((const double*)(contacts.normal.data + i), count);
         C::lanes weight = C::lanes{} + 1.0 / number;
         if (total != 0.0)
             weight = C::measure_length(Float64::minus(p1, p0)) / total;
@@ -54,26 +55,27 @@ wp::vec_t<6, wp::float64> simd_sum_means(const Contacts& contacts, wp::vec_t<2, 
         const C::lanes x[6] = {weight * (0.5 * a.x + 0.5 * b.x),
                                weight * (0.5 * a.y + 0.5 * b.y),
                                weight * (0.5 * a.z + 0.5 * b.z),
-                               weight * normal.x,
-                               weight * normal.y,
-                               weight * normal.z};
+                               weight * n.x,
+                               weight * n.y,
+                               weight * n.z};
         for (int k = 0; k < count; ++k)
             for (int c = 0; c < 6; ++c)
                 sum[c] += x[c][k];
         if ((i + count - ends[0]) % CHUNK == 0 || i + count == ends[1])
             for (int c = 0; c < 6; ++c) {
-                result[c] += sum[c];
+                all[c] += sum[c];
                 sum[c] = 0.0;
             }
     }
-    return result;
+    middle = wp::vec_t<3, wp::float64>(all[0], all[1], all[2]);
+    normal = wp::vec_t<3, wp::float64>(all[3], all[4], all[5]);
 }
 
 template <class Contacts>
-wp::vec_t<6, wp::float64> simd_sum_areas(const Contacts& contacts, wp::vec_t<2, wp::int32> ends,
-                                         wp::vec_t<3, wp::float64> middle, wp::vec_t<3, wp::float64> normal) {
+void simd_sum_areas(const Contacts& contacts, wp::vec_t<2, wp::int32> ends, wp::vec_t<3, wp::float64> middle,
+                    wp::vec_t<3, wp::float64> normal, wp::float64& area, wp::float64& change) {
 #pragma clang fp contract(off)
-    wp::vec_t<6, wp::float64> result;
+    wp::float64 all[2] = {};
     typedef Contact64 C;
     typedef C::Point Point;
     const auto spread = [](const wp::vec_t<3, wp::float64>& v) {
@@ -95,17 +97,18 @@ wp::vec_t<6, wp::float64> simd_sum_areas(const Contacts& contacts, wp::vec_t<2, 
         // As `loop_change`.
         const C::lanes cosine = C::dot(a, b), square = 1.0 - cosine * cosine, y = C::dot(n, b) / square;
         const Point across = {b.x - a.x * cosine, b.y - a.y * cosine, b.z - a.z * cosine};
-        const C::lanes change = square < LEAST_SINE_SQUARED ? C::lanes{} : y * C::dot(across, C::cross(s, n));
-        const C::lanes area = 0.5 * C::dot(n, C::cross(r, s));
-        const C::lanes x[2] = {crossed == 0.0 ? C::lanes{} : area, crossed == 0.0 ? C::lanes{} : change};
+        const C::lanes changes = square < LEAST_SINE_SQUARED ? C::lanes{} : y * C::dot(across, C::cross(s, n));
+        const C::lanes areas = 0.5 * C::dot(n, C::cross(r, s));
+        const C::lanes x[2] = {crossed == 0.0 ? C::lanes{} : areas, crossed == 0.0 ? C::lanes{} : changes};
         for (int k = 0; k < count; ++k)
             for (int c = 0; c < 2; ++c)
                 sum[c] += x[c][k];
         if ((i + count - ends[0]) % CHUNK == 0 || i + count == ends[1])
             for (int c = 0; c < 2; ++c) {
-                result[c] += sum[c];
+                all[c] += sum[c];
                 sum[c] = 0.0;
             }
     }
-    return result;
+    area = all[0];
+    change = all[1];
 }

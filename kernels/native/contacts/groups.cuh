@@ -58,7 +58,8 @@ inline CUDA_CALLABLE wp::vec_t<2, wp::float64> greatest_of_group(wp::float64 x, 
     return wp::vec_t<2, wp::float64>(x, wp::float64(item));
 }
 
-inline CUDA_CALLABLE wp::int32 rank_in_group(bool flag) {
+inline CUDA_CALLABLE wp::int32 next_place_of_group(wp::int32& end, bool flag) {
+    wp::int32 place = end;
 #if defined(__CUDA_ARCH__)
     __shared__ int counts[32];
     const unsigned int votes = __ballot_sync(0xffffffffu, flag);
@@ -74,8 +75,10 @@ inline CUDA_CALLABLE wp::int32 rank_in_group(bool flag) {
             total += counts[k];
         }
     }
-    return total << 16 | before;
+    place += before;
+    end += total;
 #else
-    return flag << 16;
+    end += flag;
 #endif
+    return place;
 }

@@ -4,7 +4,8 @@
 #include "distance/faces32.h"
 
 template <class Corners>
-CUDA_CALLABLE wp::vec_t<2, wp::float32> bound_faces(wp::float32 own, const Corners& a, const Corners& b) {
+CUDA_CALLABLE void bound_faces(wp::float32 own, const Corners& a, const Corners& b, wp::float32& lower,
+                               wp::float32& upper) {
     typedef NearestFaces N;
     N::Corners c;
     const N::lanes zero = {};
@@ -14,5 +15,6 @@ CUDA_CALLABLE wp::vec_t<2, wp::float32> bound_faces(wp::float32 own, const Corne
     }
     N::lanes size;
     const N::lanes d = N::F::root(N::measure(c, size)), error = N::error_of(d, size, own);
-    return wp::vec_t<2, wp::float32>(N::F::first(d - error), N::F::first(d + error));
+    lower = N::F::first(d - error);
+    upper = N::F::first(d + error);
 }

@@ -53,10 +53,10 @@ void measure_faces(const ModelPool& models, const StatePool& states, const PairP
     h.face_tests += count;
 }
 
-template <class ModelPool, class StatePool, class PairPose, class SearchScale, class Slabs>
-wp::vec_t<3, wp::int32> search_nearest(const ModelPool& models, const StatePool& states, const PairPose& pose,
-                                       const SearchScale& scaling, wp::vec_t<4, wp::float32> terms, const Slabs& slabs,
-                                       bool with_slabs, wp::int32 thread, wp::array_t<wp::float32> memory) {
+template <class ModelPool, class StatePool, class PairPose, class SearchScale, class Slabs, class PairTests>
+bool search_nearest(const ModelPool& models, const StatePool& states, const PairPose& pose, const SearchScale& scaling,
+                    wp::vec_t<4, wp::float32> terms, const Slabs& slabs, bool with_slabs, wp::int32 thread,
+                    wp::array_t<wp::float32> memory, PairTests& tests) {
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
     const auto& r = pose.rotation32.data;
@@ -123,12 +123,14 @@ wp::vec_t<3, wp::int32> search_nearest(const ModelPool& models, const StatePool&
             m.take_later(limits.soon, limits.limit, top, later);
         } else if (top == 0) {
             m.keep_open();
-            return wp::vec_t<3, wp::int32>(1, node_tests, h.face_tests);
+            tests.nodes = node_tests;
+            tests.faces = h.face_tests;
+            return false;
         }
     }
     h.top = top;
     h.later = later;
     h.waiting = waiting;
     h.node_tests = node_tests;
-    return wp::vec_t<3, wp::int32>(0, node_tests, h.face_tests);
+    return true;
 }

@@ -4,14 +4,14 @@
 #include "intersect/node_boxes.h"
 #include "intersect/pair_lists.h"
 
-template <class StatePool, class PairPose>
-wp::vec_t<3, wp::int64> descend(const StatePool& states, const PairPose& pose, wp::int32 at_once, wp::int32 ready,
-                                wp::int64 most, wp::int32 top, wp::array_t<wp::int64> stack,
-                                wp::array_t<wp::int64> faces) {
+template <class StatePool, class PairPose, class Descent>
+wp::int32 descend(const StatePool& states, const PairPose& pose, wp::int64 most, Descent& descent,
+                  wp::array_t<wp::int64> stack, wp::array_t<wp::int64> faces) {
     typedef NodeBoxes::groups groups;
     typedef NodeBoxes::bits bits;
     const NodeBoxes boxes = NodeBoxes::make(pose, states.node_box.data);
-    PairLists lists = {stack.data, faces.data, top, 0};
+    PairLists lists = {stack.data, faces.data, descent.top, 0};
+    const int at_once = descent.at_once, ready = descent.ready;
     wp::int64 compared = 0;
     while (lists.end > 0 && lists.waiting < ready && compared < most) {
         const int count = lists.fitting(at_once);
@@ -28,28 +28,28 @@ wp::vec_t<3, wp::int64> descend(const StatePool& states, const PairPose& pose, w
             lists.append(skip, face, boxes.overlapping(a, b) & taken[i].used);
         }
     }
-    wp::vec_t<3, wp::int64> result;
-    result[0] = lists.end;
-    result[1] = lists.waiting;
-    result[2] = compared;
-    return result;
+    descent.top = lists.end;
+    descent.tests += compared;
+    return lists.waiting;
 }
 
-inline wp::vec_t<2, wp::int32> move_below(wp::vec_t<2, wp::int32> floors, wp::int32 top, wp::array_t<wp::int64> stack,
-                                          wp::array_t<wp::int64> below) {
+template <class Descent>
+void move_below(Descent& descent, wp::array_t<wp::int64> stack, wp::array_t<wp::int64> below) {
     // Whether a node, or both children of one, lie in a subtree whose root is on a level.
     auto is_below = [](unsigned int half, int floor) {
         return 31 - __builtin_clz(half & 0x7fffffff) - (int)(half >> 31) >= floor;
     };
     wp::int64* items = stack.data;
+    const int top = descent.top, floor_a = descent.floors[0], floor_b = descent.floors[1];
     const int first = top > ITEMS_AT_ONCE ? top - ITEMS_AT_ONCE : 0;
     int end = first, deep = 0;
     for (int i = first; i < top; ++i) {
         const wp::int64 item = items[i];
-        if (is_below((unsigned int)(item >> 32), floors[0]) && is_below((unsigned int)item, floors[1]))
+        if (is_below((unsigned int)(item >> 32), floor_a) && is_below((unsigned int)item, floor_b))
             below.data[deep++] = item;
         else
             items[end++] = item;
     }
-    return wp::vec_t<2, wp::int32>(end, deep);
+    descent.top = end;
+    descent.deep = deep;
 }

@@ -42,11 +42,11 @@ struct FilterCorners {
     }
 };
 
-template <class ModelPool, class StatePool, class PairPose>
-wp::vec_t<4, wp::int64> simd_float32_filter(const ModelPool& models, const StatePool& states, const PairPose& pose,
-                                            wp::vec_t<3, wp::float32> bounds, bool first_ends, wp::int32 waiting,
-                                            wp::array_t<wp::int64> faces, wp::array_t<wp::int64> uncertain,
-                                            wp::array_t<wp::int64> apart) {
+template <class ModelPool, class StatePool, class PairPose, class Filtered>
+void simd_float32_filter(const ModelPool& models, const StatePool& states, const PairPose& pose,
+                         wp::vec_t<3, wp::float32> bounds, bool first_ends, wp::int32 waiting,
+                         wp::array_t<wp::int64> faces, wp::array_t<wp::int64> uncertain, wp::array_t<wp::int64> apart,
+                         Filtered& found) {
 #pragma clang fp contract(off)
     typedef Float32 F;
     typedef F::bits bits;
@@ -54,9 +54,7 @@ wp::vec_t<4, wp::int64> simd_float32_filter(const ModelPool& models, const State
     typedef int loose __attribute__((vector_size(64), aligned(4)));
     typedef wp::int64 longs __attribute__((vector_size(64)));
     const float error = bounds[0], unit = bounds[1], gap = bounds[2];
-    wp::int64* list = faces.data;
-    wp::int64* rest = uncertain.data;
-    wp::int64* beside = apart.data;
+    wp::int64 *list = faces.data, *rest = uncertain.data, *beside = apart.data;
     int met = 0, open = 0, done = 0, near_count = 0;
     if (error == __builtin_inff()) {
         for (; open < waiting; ++open)
@@ -119,5 +117,8 @@ wp::vec_t<4, wp::int64> simd_float32_filter(const ModelPool& models, const State
         append(list + met, meet);
         met += __builtin_popcount(meet);
     }
-    return wp::vec_t<4, wp::int64>(met, open, done, near_count);
+    found.met = met;
+    found.uncertain = open;
+    found.apart = near_count;
+    found.tested = done;
 }

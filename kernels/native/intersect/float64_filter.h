@@ -111,10 +111,9 @@ struct Float64Filter {
     }
 };
 
-template <class ModelPool, class StatePool, class PairPose>
-wp::vec_t<3, wp::int64> simd_float64_filter(const ModelPool& models, const StatePool& states, const PairPose& pose,
-                                            bool first_ends, wp::int32 met, wp::int32 waiting,
-                                            wp::array_t<wp::int64> uncertain, wp::array_t<wp::int64> faces) {
+template <class ModelPool, class StatePool, class PairPose, class Filtered>
+void simd_float64_filter(const ModelPool& models, const StatePool& states, const PairPose& pose, bool first_ends,
+                         Filtered& found, wp::array_t<wp::int64> uncertain, wp::array_t<wp::int64> faces) {
 #pragma clang fp contract(off)
     typedef Float64 F;
     typedef Float64Filter<PairPose> Filter;
@@ -128,7 +127,7 @@ wp::vec_t<3, wp::int64> simd_float64_filter(const ModelPool& models, const State
     const Filter filter = {pose, position, (const double*)states.face_corner.data};
     wp::int64* rest = uncertain.data;
     wp::int64* hits = faces.data;
-    int open = 0, kept = 0;
+    int met = found.met, open = 0, kept = 0;
     // Straddling pairs, which two more signs decide, and their corners, rotated: p, q, r of A and of B.
     typename Filter::ids rotated[6], start[6];
     wp::int64 straddling[STRADDLING_ROOM];
@@ -140,7 +139,7 @@ wp::vec_t<3, wp::int64> simd_float64_filter(const ModelPool& models, const State
             filter.order_ends(rotated, straddling, i, kept - i < 8 ? kept - i : 8, hits, met, rest, open);
         kept = 0;
     };
-    const int before = met, at_once = first_ends ? 8 : STRADDLING_ROOM;
+    const int waiting = found.uncertain, before = met, at_once = first_ends ? 8 : STRADDLING_ROOM;
     int done = 0;
     while (done < waiting && (met == before || !first_ends)) {
         const int count = waiting - done < 8 ? waiting - done : 8;
@@ -187,5 +186,7 @@ wp::vec_t<3, wp::int64> simd_float64_filter(const ModelPool& models, const State
         if (last || kept > STRADDLING_ROOM - 16)
             order_kept();
     }
-    return wp::vec_t<3, wp::int64>(met, open, done);
+    found.met = met;
+    found.uncertain = open;
+    found.tested = done;
 }

@@ -20,11 +20,10 @@ wp::int64 slab_cost(const ModelPool& models, const StatePool& states, const Pair
     return cost;
 }
 
-template <class ModelPool, class StatePool, class PairPose>
-wp::vec_t<2, wp::int32> open_subtrees(const ModelPool& models, const StatePool& states, const PairPose& pose,
-                                      wp::int32 thread, wp::array_t<wp::float32> memory) {
-    wp::vec_t<2, wp::int32> floors;
-    const Slabs::Memory kept = Slabs::find_memory(memory.data, memory.shape[1], thread);
+template <class ModelPool, class StatePool, class PairPose, class Descent>
+void open_subtrees(const ModelPool& models, const StatePool& states, const PairPose& pose, Descent& descent,
+                   wp::array_t<wp::float32> memory) {
+    const Slabs::Memory kept = Slabs::find_memory(memory.data, memory.shape[1], descent.thread);
     const Slabs::Box* nodes = (const Slabs::Box*)states.node_box.data;
     const Slabs::Content a = Slabs::content_of(states.node_start.data, states.model.data, states.lod.data, pose.node_a);
     if (!(*kept.whose == a)) {
@@ -64,7 +63,6 @@ wp::vec_t<2, wp::int32> open_subtrees(const ModelPool& models, const StatePool& 
         kept.of_b[48 + d] = (float)(scale * (middle - shift));
         kept.of_b[64 + d] = scale > 0.0 ? (float)margin : 65536.0f;
     }
-    kept.floors[0] = floors[0] = Slabs::find_floor(nodes + pose.node_a);
-    kept.floors[1] = floors[1] = Slabs::find_floor(nodes + pose.node_b);
-    return floors;
+    kept.floors[0] = descent.floors[0] = Slabs::find_floor(nodes + pose.node_a);
+    kept.floors[1] = descent.floors[1] = Slabs::find_floor(nodes + pose.node_b);
 }

@@ -5,15 +5,14 @@
 #include "intersect/slabs.h"
 #include "search/siblings.h"
 
-template <class ModelPool, class StatePool, class PairPose>
-wp::vec_t<3, wp::int64> descend_subtrees(const ModelPool& models, const StatePool& states, const PairPose& pose,
-                                         wp::int32 thread, wp::int32 ready, wp::int32 top, wp::array_t<wp::int64> stack,
-                                         wp::array_t<wp::float32> memory, wp::array_t<wp::int64> faces) {
-    wp::vec_t<3, wp::int64> result;
+template <class ModelPool, class StatePool, class PairPose, class Descent>
+wp::int32 descend_subtrees(const ModelPool& models, const StatePool& states, const PairPose& pose, Descent& descent,
+                           wp::array_t<wp::int64> below, wp::array_t<wp::float32> memory,
+                           wp::array_t<wp::int64> faces) {
     typedef Slabs::lanes lanes;
     typedef Slabs::Record Record;
     typedef bool flags __attribute__((ext_vector_type(32)));
-    const Slabs::Memory kept = Slabs::find_memory(memory.data, memory.shape[1], thread);
+    const Slabs::Memory kept = Slabs::find_memory(memory.data, memory.shape[1], descent.thread);
     const Slabs::Box* nodes = (const Slabs::Box*)states.node_box.data;
     const int* corners = (const int*)states.face_corner.data;
     const lanes *of_a = (const lanes*)kept.of_a, *of_b = (const lanes*)kept.of_b;
@@ -35,7 +34,8 @@ wp::vec_t<3, wp::int64> descend_subtrees(const ModelPool& models, const StatePoo
                                    kept.roots + kept.slots,
                                    kept.records + records_b}};
     const void* near = models.vertex_near.data;
-    PairLists lists = {stack.data, faces.data, top, 0};
+    PairLists lists = {below.data, faces.data, descent.deep, 0};
+    const int ready = descent.ready;
     wp::int64 compared = 0;
     struct Taken {
         const Record *a, *b;
@@ -75,8 +75,7 @@ wp::vec_t<3, wp::int64> descend_subtrees(const ModelPool& models, const StatePoo
             lists.append(skip, face, mask);
         }
     }
-    result[0] = lists.end;
-    result[1] = lists.waiting;
-    result[2] = compared;
-    return result;
+    descent.deep = lists.end;
+    descent.tests += compared;
+    return lists.waiting;
 }

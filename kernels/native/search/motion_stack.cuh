@@ -31,19 +31,3 @@ inline CUDA_CALLABLE void write_entry(wp::uint64 items, wp::int32 i, wp::int64 i
 inline CUDA_CALLABLE void write_time(wp::uint64 items, wp::int32 i, wp::float64 time) {
     *entry<volatile double>(items, MOTION_TIMES_START + i) = time;
 }
-
-inline CUDA_CALLABLE wp::int32 place_in(wp::int32 end, bool flag) {
-#if defined(__CUDA_ARCH__)
-    return end + __popc(__ballot_sync(0xffffffffu, flag) & ((1u << threadIdx.x) - 1u));
-#else
-    return end;
-#endif
-}
-
-inline CUDA_CALLABLE wp::int32 end_after(wp::int32 end, bool flag) {
-#if defined(__CUDA_ARCH__)
-    return end + __popc(__ballot_sync(0xffffffffu, flag));
-#else
-    return end + flag;
-#endif
-}

@@ -26,9 +26,9 @@ inline CUDA_CALLABLE void write_bound(wp::uint64 items, wp::int32 i, wp::float32
     *entry<volatile float>(items, 2 * NEAREST_LENGTH + i) = bound;
 }
 
-inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp::int32 leaf_end,
-                                            wp::vec_t<4, wp::int32> kinds, wp::vec_t<4, wp::int64> children,
-                                            wp::vec_t<4, wp::float32> bounds) {
+inline CUDA_CALLABLE void push_nearest(wp::uint64 items, wp::int32& end, wp::int32& leaf_end,
+                                       wp::vec_t<4, wp::int32> kinds, wp::vec_t<4, wp::int64> children,
+                                       wp::vec_t<4, wp::float32> bounds) {
     // The nearest of each lane comes last, so that it is taken first.
     int order[5][2] = {{0, 1}, {2, 3}, {0, 2}, {1, 3}, {1, 2}};
 #pragma unroll
@@ -67,11 +67,10 @@ inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp:
         }
 #endif
     }
-    return ((long long)leaf_end << 32) | (unsigned int)end;
 }
 
-inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp::vec_t<4, wp::int32> kinds,
-                                             wp::vec_t<4, wp::int64> children) {
+inline CUDA_CALLABLE void push_in_order(wp::uint64 items, wp::int32& end, wp::vec_t<4, wp::int32> kinds,
+                                        wp::vec_t<4, wp::int64> children) {
     const int mine = (kinds[0] != 0) + (kinds[1] != 0) + (kinds[2] != 0) + (kinds[3] != 0);
 #if defined(__CUDA_ARCH__)
     int sum = mine;
@@ -88,7 +87,7 @@ inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp
             *entry<volatile long long>(items, at) = children[k];
             *entry<volatile float>(items, 2 * NEAREST_LENGTH + at) = (float)kinds[k];
         }
-    return top;
+    end = top;
 #else
     int at = end + mine;
     for (int k = 0; k < 4; ++k)
@@ -97,21 +96,14 @@ inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp
             ((long long*)items)[at] = children[k];
             ((float*)((long long*)items + NEAREST_LENGTH))[at] = (float)kinds[k];
         }
-    return end + mine;
+    end += mine;
 #endif
 }
 
-inline CUDA_CALLABLE wp::int32 push_open(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item,
-                                         wp::float32 bound) {
-#if defined(__CUDA_ARCH__)
-    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    const int at = end + __popc(votes & ((1u << threadIdx.x) - 1u)), more = __popc(votes);
-#else
-    const int at = end, more = flag;
-#endif
+inline CUDA_CALLABLE void push_open(wp::uint64 items, wp::int32& end, bool flag, wp::int64 item, wp::float32 bound) {
+    const int at = next_place(end, flag);
     if (flag) {
         *entry<volatile long long>(items, NEAREST_OPEN_START + at) = item;
         *entry<volatile float>(items, 2 * NEAREST_LENGTH + NEAREST_OPEN_START + at) = bound;
     }
-    return end + more;
 }

@@ -4,10 +4,10 @@
 #include "base/shared.cuh"
 #include "base/sizes.h"
 
-inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp::vec_t<3, wp::int32> ends,
-                                                           wp::vec_t<4, wp::int32> lists,
-                                                           wp::vec_t<4, wp::int64> children) {
-    const int end = ends[0], slab_end = ends[1], leaf_end = ends[2];
+template <class WarpLists>
+CUDA_CALLABLE void push_children(WarpLists& own, wp::vec_t<4, wp::int32> lists, wp::vec_t<4, wp::int64> children) {
+    const wp::uint64 items = own.items;
+    const int end = own.end, slab_end = own.slab_pairs, leaf_end = own.leaf_pairs;
 #if defined(__CUDA_ARCH__)
     unsigned int emitted[4];
 #pragma unroll
@@ -51,5 +51,7 @@ inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp:
             list[STACK_LENGTH + leaf_end + more_leaves++] = children[k];
     }
 #endif
-    return wp::vec_t<3, wp::int32>(end + more_items, slab_end + more_slab, leaf_end + more_leaves);
+    own.end = end + more_items;
+    own.slab_pairs = slab_end + more_slab;
+    own.leaf_pairs = leaf_end + more_leaves;
 }

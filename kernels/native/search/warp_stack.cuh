@@ -1,6 +1,7 @@
 // A warp's lists in shared memory, and what its lanes do together. On the CPU a warp is one thread.
 #pragma once
 #include "builtin.h"
+#include "base/lanes.cuh"
 #include "base/shared.cuh"
 #include "base/sizes.h"
 
@@ -21,31 +22,19 @@ inline CUDA_CALLABLE void write_item(wp::uint64 items, wp::int32 i, wp::int64 it
     *entry<volatile long long>(items, i) = item;
 }
 
-inline CUDA_CALLABLE wp::int32 push_items(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item) {
-#if defined(__CUDA_ARCH__)
-    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    const int at = end + __popc(votes & ((1u << threadIdx.x) - 1u)), more = __popc(votes);
-#else
-    const int at = end, more = flag;
-#endif
+inline CUDA_CALLABLE void push_items(wp::uint64 items, wp::int32& end, bool flag, wp::int64 item) {
+    const int at = next_place(end, flag);
     if (flag)
         *entry<volatile long long>(items, at & (STACK_LENGTH - 1)) = item;
-    return end + more;
 }
 
-inline CUDA_CALLABLE wp::int32 push_straddling(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item,
-                                               wp::int32 signs) {
-#if defined(__CUDA_ARCH__)
-    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    const int at = end + __popc(votes & ((1u << threadIdx.x) - 1u)), more = __popc(votes);
-#else
-    const int at = end, more = flag;
-#endif
+inline CUDA_CALLABLE void push_straddling(wp::uint64 items, wp::int32& end, bool flag, wp::int64 item,
+                                          wp::int32 signs) {
+    const int at = next_place(end, flag);
     if (flag) {
         *entry<volatile long long>(items, STRADDLING_START + at) = item;
         *entry<volatile int>(items, 2 * SIGNS_START + at) = signs;
     }
-    return end + more;
 }
 
 inline CUDA_CALLABLE wp::int32 read_signs(wp::uint64 items, wp::int32 i) {
@@ -66,8 +55,8 @@ inline CUDA_CALLABLE wp::uint64 signed_pairs() {
 #endif
 }
 
-inline CUDA_CALLABLE wp::int32 push_signed_pair(wp::uint64 list, wp::int32 end, bool flag, wp::vec_t<3, wp::int32> item,
-                                                wp::int32 signs) {
+inline CUDA_CALLABLE void push_signed_pair(wp::uint64 list, wp::int32& end, bool flag, wp::vec_t<3, wp::int32> item,
+                                           wp::int32 signs) {
 #if defined(__CUDA_ARCH__)
     const unsigned int votes = __ballot_sync(0xffffffffu, flag);
     const int at = end + __popc(votes & ((1u << (threadIdx.x & 31)) - 1u)), more = __popc(votes);
@@ -76,10 +65,11 @@ inline CUDA_CALLABLE wp::int32 push_signed_pair(wp::uint64 list, wp::int32 end, 
 #endif
     if (flag)
         *entry<SignedPair>(list, at) = SignedPair{item[0], item[1], item[2], signs};
-    return end + more;
+    end += more;
 }
 
-inline CUDA_CALLABLE wp::vec_t<4, wp::int32> read_signed_pair(wp::uint64 list, wp::int32 i) {
+inline CUDA_CALLABLE wp::int32 read_signed_pair(wp::uint64 list, wp::int32 i, wp::vec_t<3, wp::int32>& item) {
     const SignedPair x = *entry<SignedPair>(list, i);
-    return wp::vec_t<4, wp::int32>(x.first, x.second, x.third, x.signs);
+    item = wp::vec_t<3, wp::int32>(x.first, x.second, x.third);
+    return x.signs;
 }
