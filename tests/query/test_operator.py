@@ -7,6 +7,7 @@ from helpers.faults import MORE_PAIRS, add_objects, check_buffer_lengths
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
+from warp_abtree import testing
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.stage import Array, Stage
 from warp_abtree.query.stages.inside import InsideStage
@@ -86,3 +87,48 @@ def test_a_captured_query_of_solids_follows_lods(device):
         found, fresh = query.result(), ab.Query(scene, "count", pairs=pairs).run()
         np.testing.assert_array_equal(found.count, fresh.count)
         np.testing.assert_array_equal(found.any, fresh.any)
+
+
+def test_distances_after_more_tree_states_than_there_was_room_for(device, monkeypatch):
+    """Slabs are made anew, not read from memory that nothing has written; in the regimes of threads and of warps."""
+
+    def dirty(shape, dtype=float, **options):
+        array = empty(shape, dtype=dtype, **options)
+        if dtype is wp.vec4:
+            array.fill_(wp.vec4(1.0, 0.0, 0.0, -9.0))
+        return array
+
+    empty, most = wp.empty, sample("ball").lod_max
+    for regime in ({}, {"warps": True}):
+        scene = ab.Scene(device)
+        for i in range(4):
+            scene.add(sample("ball"), (2.2 * i, 0.3 * i, 0.2 * i, 0, 0, 0, 1))
+        with testing.regime(**regime), monkeypatch.context() as patch:
+            query = ab.DistanceQuery(scene, [(0, 1), (1, 2), (2, 3)] * 12)
+            query.run()
+            query.run()
+            patch.setattr(wp, "empty", dirty)
+            for lods in ([most, most // 2, most, most], [most // 3, most // 2, most, most // 5]):
+                scene.set_lods(lods)
+                query.forget()
+                found, fresh = query.run(), ab.DistanceQuery(scene, query.given).run()
+                np.testing.assert_array_equal(found.distance, fresh.distance)
+                np.testing.assert_array_equal(found.bracket, fresh.bracket)
+
+
+def test_room_keeps_given_pairs(device):
+    scene = add_objects(device)
+    query = ab.ContactQuery(scene, MORE_PAIRS, gap=0.05)
+    expected = query.run()
+    query.make_room(pairs=3 * len(MORE_PAIRS), hits=4 * len(expected.contacts))
+    found = query.run()
+    assert found.pairs.tolist() == MORE_PAIRS.tolist() and found.contacts.tobytes() == expected.contacts.tobytes()
+
+
+def test_first_contacts_after_a_filter(device):
+    scene = add_objects(device)
+    ends = np.tile([0.0, 0, 0, 0, 0, 0, 1], (4, 1))
+    first = scene.first_contact(None, ends)
+    scene.filter(first.pairs[:1])
+    again = scene.first_contact(None, ends)
+    assert again.pairs.tolist() == first.pairs[1:].tolist() and again.time.tolist() == first.time[1:].tolist()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers import refused
 from helpers.bodies import ring_and_ball
+from helpers.samples import sample
 from helpers.scenes import scene_with
 
 import warp_abtree as ab
@@ -325,3 +326,20 @@ def test_worlds_alone_and_together_are_the_same(device, kind, moved):
     assert found[0] != found[1] and any(seen[2] for seen in found[2])
     for world in range(3):
         assert run_worlds(device, (world,), kind, moved)[world] == found[world]
+
+
+def test_a_scene_or_motion_of_others(device):
+    """Frames go on where objects were added; a motion of other objects is refused."""
+    scene, others = (ab.Scene(device) for _ in range(2))
+    for i in range(3):
+        scene.add(sample("ball"), (1.2 * i, 0, 0, 0, 0, 0, 1))
+    frame = ab.Frame(scene)
+    frame.step()
+    scene.add(sample("ball"), (9, 0, 0, 0, 0, 0, 1))
+    assert len(frame.step().pairs) == len(scene.broad_phase()) and frame.history[-1].objects == 4
+    others.add_many([sample("ball")] * 4, np.tile([0.0, 0, 0, 0, 0, 0, 1], (4, 1)))
+    for motion, told in (([0] * 3, "of 3 objects, the scene has 4"), (ab.Dynamics(others).motion(), "another scene")):
+        frame.motion = motion
+        refused(ValueError, told, frame.step)
+    frame.motion = None
+    assert frame.step().any.tolist() == scene.intersect().any.tolist()

@@ -74,6 +74,7 @@ class Operator(DeviceMemory):
         check_device(scene.device, f"making a {type(self).__name__}")
         room = check_capacity(capacity)
         self.device, self.regime, self.stages, self.output = scene.device, current_regime(), stages, output
+        self.lanes = 32 if self.device.is_cuda else 1  # threads of a warp
         with loading(self.device, operator_kernels(self.device, stages, output)):
             self.batch = batch = scene if isinstance(scene, Batch) else scene.batch()
             if self.uses_warps() and self.regime.slabs:
@@ -93,8 +94,6 @@ class Operator(DeviceMemory):
         hits = (room.hits or max(1024, 16 * places)) if output == "faces" else 0
         self.rooms = Rooms()
         self.make_room(places, hits, uncertain)
-        if pairs is not None:
-            self.replace_pairs(self.given)
 
     def _attach_stages(self):
         """Give the stages this operator, and check the distances that they were given."""
@@ -192,7 +191,9 @@ class Operator(DeviceMemory):
             for stage in self.stages:
                 stage.link()
             self.readout.link()
-            if others and self.broad_phase is not None:
+            if others:
+                if self.broad_phase is None:
+                    self.readout.write_pairs(self.given)
                 self._fill_distances()
 
     @contextmanager
@@ -295,12 +296,16 @@ class Operator(DeviceMemory):
             for report in self._reports:
                 report(count)
 
+    def is_filtered(self) -> bool:
+        """Return whether pairs were filtered out of the scene that the broad phase would find."""
+        return self.broad_phase is not None and len(self.batch.excluded) > self._excluded_count
+
     def check_scene(self):
-        """Raise RuntimeError where the scene is no longer that of the operator, or a graph is being captured."""
+        """Raise RuntimeError where the scene is another one, or a graph is being captured."""
         check_device(self.device)
         self.check_whole()
         self.batch.check("query")
-        if self.broad_phase is not None and len(self.batch.excluded) > self._excluded_count:
+        if self.is_filtered():
             raise RuntimeError("pairs were filtered out of the scene since this query was made; make a new one")
 
     def find_launches(self, name: str, make, *given) -> list:
@@ -325,11 +330,6 @@ class Operator(DeviceMemory):
     def launch_warps(self, kernel, count: int, inputs: list):
         """Launch a kernel with a warp for each of so many items, on the CPU a thread."""
         self.launch_kernel(kernel, count * self.lanes, inputs, 32)
-
-    @property
-    def lanes(self) -> int:
-        """Return the threads of a warp; 1 on the CPU."""
-        return 32 if self.device.is_cuda else 1
 
     def result(self, device: bool = False) -> Result:
         """Return the results of the last launch, sorted. Waits for the device.

@@ -95,7 +95,8 @@ def check_options(caller: str, taken: dict, output: str, precision: str, options
         ValueError: An unknown output or precision, or an option that means nothing for this output.
     """
     if not _KNOWN[id(taken)].issuperset(options):
-        raise TypeError(f"{caller} has no option {min(set(options) - _KNOWN[id(taken)])!r}")
+        asked = f" for output {output!r}" if len(taken) == 1 else ""
+        raise TypeError(f"{caller} has no option {min(set(options) - _KNOWN[id(taken)])!r}{asked}")
     given = {name: value for name, value in options.items() if value is not None and value is not False}
     if output not in taken:
         check_request(output, precision)

@@ -26,11 +26,14 @@ class Array(NamedTuple):
     dtype: Any
     shape: Any
     fill: Any = None  # a value, or what is called with the new array; None: whatever was there
+    is_stale: bool = False  # what stands there is of no more use, whatever its shape
 
     def is_in_place(self) -> bool:
-        """Return whether the attribute holds an array of this shape."""
+        """Return whether the attribute holds an array of this shape that is of use."""
         array, shape = getattr(self.owner, self.name, None), self.shape
-        return array is not None and array.shape == (shape if isinstance(shape, tuple) else (shape,))
+        return (
+            not self.is_stale and array is not None and array.shape == (shape if isinstance(shape, tuple) else (shape,))
+        )
 
     def make(self, device) -> wp.array:
         """Return a new array."""

@@ -121,7 +121,7 @@ class KeptQueries:
         key = "first contact", bool(linear), pairs is None
         FirstContactQuery.plan(tolerance, screw, linear)  # checks them
         query = self.kept.pop(key, None)
-        if query is None:
+        if query is None or query.is_filtered():
             query = FirstContactQuery(self._scene, end_poses, pairs, tolerance=tolerance, screw=screw, linear=linear)
         else:
             query.set_options(tolerance, screw)

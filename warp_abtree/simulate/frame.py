@@ -29,6 +29,7 @@ from warp_abtree.simulate.frame_file import FrameFile
 from warp_abtree.simulate.frame_graphs import FrameGraphs
 from warp_abtree.simulate.frame_row import ROW_FIELDS, FrameRow, LodTracker
 from warp_abtree.simulate.frame_stages import FrameStages
+from warp_abtree.simulate.rigid_bodies import SteppedMotion
 from warp_abtree.state.work_lists import full_refit_fraction
 
 
@@ -74,6 +75,14 @@ class OpenFrame:
         return 0 if self.changes is None else int(np.sum(self.changes.nodes_refitted, dtype=np.int64))
 
 
+def check_motion(motion, scene: Scene):
+    """Raise ValueError for a motion of another number of objects, or of bodies of another scene."""
+    if motion is not None and len(motion) != scene.object_count:
+        raise ValueError(f"the motion is of {len(motion)} objects, the scene has {scene.object_count}")
+    if isinstance(motion, SteppedMotion) and motion.dynamics.scene is not scene:
+        raise ValueError("the motion is of the bodies of another scene")
+
+
 class Frame(DeviceMemory):
     """Runs a scene frame by frame and keeps a `FrameRow` on each.
 
@@ -115,8 +124,7 @@ class Frame(DeviceMemory):
         time_step: float = 1 / 60,
         clock: Callable[[], float] | None = None,
     ):
-        if motion is not None and len(motion) != scene.object_count:
-            raise ValueError(f"the motion is of {len(motion)} objects, the scene has {scene.object_count}")
+        check_motion(motion, scene)
         if not (lods is None or callable(lods) or isinstance(lods, Controller)):
             raise ValueError(f"lods: a {type(lods).__name__} is neither a controller nor a function of time")
         if not (clock is None or callable(clock)):
@@ -166,6 +174,7 @@ class Frame(DeviceMemory):
         """Return the stages of the frame, made anew where scene, motion, controller or output are others."""
         asked = self.scene, self.motion, self.lods if isinstance(self.lods, Controller) else None, self.output
         if self._stages is None or not self._stages.serves(*asked):
+            check_motion(self.motion, self.scene)
             self._open, self._graphs = None, FrameGraphs(self._timer)
             self._stages = FrameStages(*asked, self.time_step, self._timer.mark)
             self._lods.restart(self.scene)

@@ -112,12 +112,14 @@ class LodTracker:
     columns: dict[str, Any]
 
     def __init__(self, scene):
-        self._direction = np.zeros(scene.object_count, np.int8)
+        self._direction = np.zeros(0, np.int8)
         self.restart(scene)
 
     def restart(self, scene):
         """Take the LODs as they stand for those of the last frame."""
         self._lods = scene.batch().lods
+        if len(self._direction) != len(self._lods):
+            self._direction = np.zeros(len(self._lods), np.int8)
         self.measure(scene)
 
     def measure(self, scene) -> dict:

@@ -131,6 +131,7 @@ class DistanceStage(Stage):
         self.distances, self.found, self.slabs = report.Distances(), frame.NearestFound(), mean_slabs.Slabs()
         self.distance = PairDistance("beyond", beyond, self.found, "beyond", check_beyond)
         self._views: dict = {}
+        self._made_for: tuple = ()
 
     def attach(self, operator: Operator):
         """Take the operator."""
@@ -164,12 +165,14 @@ class DistanceStage(Stage):
         ]
 
     def _slab_arrays(self) -> list[Array]:
+        """Return the slabs of all tree states: one array notes what is made in another, so all are new at once."""
         nodes, states = self._state_rooms()
+        stale = not self.fits_states()
         return [
-            Array(self.slabs, "record", wp.vec4, nodes if self.operator.regime.slabs else 0),
-            Array(self.slabs, "made", wp.vec3i, states, wp.vec3i(-1)),
-            *(Array(self.slabs, name, wp.int32, states, 0) for name in ("uses", "ended")),
-            Array(self.slabs, "due", wp.int32, states),
+            Array(self.slabs, "record", wp.vec4, nodes if self.operator.regime.slabs else 0, None, stale),
+            Array(self.slabs, "made", wp.vec3i, states, wp.vec3i(-1), stale),
+            *(Array(self.slabs, name, wp.int32, states, 0, stale) for name in ("uses", "ended")),
+            Array(self.slabs, "due", wp.int32, states, None, stale),
         ]
 
     def _state_rooms(self) -> tuple[int, int]:

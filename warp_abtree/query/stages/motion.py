@@ -240,13 +240,13 @@ class FirstContactQuery(Operator):
         motions = FirstContactStage(check_time_tolerance(tolerance), bool(screw), bool(linear))
         return [IntersectStage(), InsideStage(), motions]
 
-    def set_pairs(self, pairs):
-        """Query other pairs from now on, in the room there is if they fit.
+    def set_pairs(self, pairs, within=None):
+        """Query other pairs from now on, in the room there is if they fit; there is no within.
 
         Raises:
             ValueError: Bad pairs, or a query that runs the broad phase.
         """
-        self.ask_pairs(pairs)
+        self.ask_pairs(pairs, within=within)
 
     def set_end_poses(self, end_poses):
         """Set where each object's motion ends, from the next launch on.

@@ -212,9 +212,9 @@ class ManifoldQuery(Operator):
         """Return where the rows of each pair start in faces and contacts."""
         return self._contacts.start
 
-    def set_pairs(self, pairs, gap=None):
-        """Query other pairs from now on, as `ContactQuery.set_pairs`."""
-        self.ask_pairs(pairs, gap=gap)
+    def set_pairs(self, pairs, within=None, gap=None):
+        """Query other pairs from now on, as `ContactQuery.set_pairs`; there is no within."""
+        self.ask_pairs(pairs, within=within, gap=gap)
 
     def result(self, device: bool = False, with_points: bool = True) -> Result:
         """Return the counts and, unless told otherwise, the contact points of the last launch, as `Query.result`."""
