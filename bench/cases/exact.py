@@ -21,7 +21,7 @@ from ..timing import ratio_of, summarise, time_in_turn
 from ..triangle_pairs import ADVERSARIAL, make_chunk
 from ..verify import count_differences, load_oracle
 
-MODULE_OPTIONS = testing.kernel_options("exact/determinant.cuh")
+MODULE_OPTIONS = testing.kernel_options("exact/determinant.cuh", "base/lanes.cuh")
 PRECISIONS = ("exact", "float32")
 FULL = {"faces": 5000, "pairs": 256, "coincident": 16, "repeats": 11}
 QUICK = {"faces": 300, "pairs": 3, "coincident": 1, "repeats": 1}
