@@ -136,7 +136,7 @@ def test_room_and_wrong_models(device):
     refused(ab.CapacityError, r"\d rigid contacts", found.collide, model.state(), found.contacts(2))
 
 
-@pytest.mark.parametrize("gap, margin, count", [(0.03, 0.0, 4), (0.02, 0.0, 0), (0.02, 0.01, 4)])
+@pytest.mark.parametrize("gap, margin, count", [(0.03, 0.0, 4), (0.02, 0.0, 0), (0.02, 0.01, 4), (0.012, 0.012, 0)])
 def test_gaps_and_margins_are_those_of_newton(device, gap, margin, count):
     """A cube 0.05 above a floor: contacts where margins and gaps of both reach that far, with what margins leave."""
     config = Config(gap=gap, margin=margin)
