@@ -34,7 +34,7 @@ class _Element:
 
     def is_needed(self, name) -> bool:
         """Return whether a property is read, not only passed over."""
-        return name in "xyz" if self.name == "vertex" else name == self.corners()
+        return name in ("x", "y", "z") if self.name == "vertex" else name == self.corners()
 
 
 def read_ply(data: bytes, where: str, remarks: Remarks) -> FileSurface:
