@@ -187,7 +187,7 @@ def test_formats_are_told_apart_and_a_geometry_without_meshes_is_named(urdf, mjc
         assert len(ab.Robot.load(path, "visual", device="cpu").models) == 1
 
 
-def test_joints_that_follow_followers_and_stand_off_are_those_of_mujoco(tmp_path, device):
+def test_joints_that_follow_followers_and_stand_off_are_those_of_mujoco(tmp_path, device, monkeypatch):
     mujoco = pytest.importorskip("mujoco")
     text = """<mujoco><worldbody><body name="one"><joint name="a" axis="0 0 1" pos=".1 0 0" ref="20"/>
     <joint name="b" type="slide" axis="1 0 0" pos="0 .2 0" ref=".1"/><joint name="c" axis="0 1 0"
@@ -197,6 +197,7 @@ def test_joints_that_follow_followers_and_stand_off_are_those_of_mujoco(tmp_path
     <joint joint1="d" joint2="c" polycoef=".1 -2 0 0 0"/><joint joint1="c" joint2="a" polycoef=".2 .5 0 0 0"/>
     <joint joint1="e" polycoef=".3 0 0 0 0"/></equality></mujoco>"""
     (tmp_path / "arm.xml").write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)  # where MuJoCo leaves its log
     arm, model = ab.Robot.load(tmp_path / "arm.xml", device=device), mujoco.MjModel.from_xml_string(text)
     assert arm.joint_names == ("a", "b") and np.isinf(arm.limits).all()
     data, start = mujoco.MjData(model), dict(zip("abcde", model.qpos0))
