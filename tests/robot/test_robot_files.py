@@ -163,7 +163,8 @@ def test_bad_urdf_is_refused(urdf, before, after, message):
         ('<joint name="turn" axis="0 0 1"/>', '<joint/><joint name="joint 0"/>', "2 joints have the name 'joint 0'"),
     ],
 )
-def test_bad_mjcf_is_refused(mjcf, before, after, message):
+def test_bad_mjcf_is_refused(mjcf, before, after, message, monkeypatch):
+    monkeypatch.chdir(mjcf.parent)  # where MuJoCo leaves its log
     assert before in MJCF
     mjcf.write_text(MJCF.replace(before, after), encoding="utf-8")
     refused(ValueError, message, ab.Robot.load, mjcf, device="cpu")
