@@ -16,6 +16,7 @@ from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.search.make_slabs import make_slab_kernel
 from warp_abtree.query.broad_phase import BroadPhase, PosedBoxes
@@ -74,7 +75,7 @@ class Operator(DeviceMemory):
         check_device(scene.device, f"making a {type(self).__name__}")
         room = check_capacity(capacity)
         self.device, self.regime, self.stages, self.output = scene.device, current_regime(), stages, output
-        self.lanes = 32 if self.device.is_cuda else 1  # threads of a warp
+        self.lanes = WARP_SIZE if self.device.is_cuda else 1  # threads of a warp
         with loading(self.device, operator_kernels(self.device, stages, output)):
             self.batch = batch = scene if isinstance(scene, Batch) else scene.batch()
             if self.uses_warps() and self.regime.slabs:
@@ -187,11 +188,11 @@ class Operator(DeviceMemory):
         with self.changing():
             for owner, name, array in made:
                 setattr(owner, name, array)
-            others, self.rooms = rooms.pairs != self.rooms.pairs, rooms
+            has_other_pairs, self.rooms = rooms.pairs != self.rooms.pairs, rooms
             for stage in self.stages:
                 stage.link()
             self.readout.link()
-            if others:
+            if has_other_pairs:
                 if self.broad_phase is None:
                     self.readout.write_pairs(self.given)
                 self._fill_distances()
@@ -329,7 +330,7 @@ class Operator(DeviceMemory):
 
     def launch_warps(self, kernel, count: int, inputs: list):
         """Launch a kernel with a warp for each of so many items, on the CPU a thread."""
-        self.launch_kernel(kernel, count * self.lanes, inputs, 32)
+        self.launch_kernel(kernel, count * self.lanes, inputs, WARP_SIZE)
 
     def result(self, device: bool = False) -> Result:
         """Return the results of the last launch, sorted. Waits for the device.

@@ -30,10 +30,9 @@ class Array(NamedTuple):
 
     def is_in_place(self) -> bool:
         """Return whether the attribute holds an array of this shape that is of use."""
-        array, shape = getattr(self.owner, self.name, None), self.shape
-        return (
-            not self.is_stale and array is not None and array.shape == (shape if isinstance(shape, tuple) else (shape,))
-        )
+        if self.is_stale or (array := getattr(self.owner, self.name, None)) is None:
+            return False
+        return array.shape == (self.shape if isinstance(self.shape, tuple) else (self.shape,))
 
     def make(self, device) -> wp.array:
         """Return a new array."""

@@ -155,8 +155,9 @@ class ContactStage(Stage):
         return [*made, *fields(self._sums, count, span=wp.vec3i, point=wp.vec3d, normal=wp.vec3d, **numbers)]
 
     def link(self):
-        """Let both lists of contacts share their array."""
+        """Let both lists of contacts share their array, and give the operator what users read."""
         self._near.place = self.deferred.place
+        self.operator.faces, self.operator.start = self.faces, self.start
 
     @staticmethod
     def _chunk_count(places: int, pairs: int) -> int:
@@ -253,11 +254,8 @@ class ContactStage(Stage):
     def _transfer_contacts(self, found: Found, count: int):
         """Pack rows on the device, and bring them over."""
         staging, pairs = self.operator.readout.staging, len(found.pairs)
-        real, (face_type, pair_type), with_gap = (
-            self._real(),
-            contact_dtypes(self.dtype, self._with_gap),
-            self._with_gap,
-        )
+        real, with_gap = self._real(), self._with_gap
+        face_type, pair_type = contact_dtypes(self.dtype, with_gap)
         memory = staging.row_pool.take(12 * count + pairs * pair_type.itemsize + count * face_type.itemsize)
 
         def pack_pairs(first, some, target):
@@ -344,6 +342,8 @@ class ContactQuery(Operator):
             missing in all of the above, on a GPU not the same in each launch.
     """
 
+    faces: wp.array
+    start: wp.array
     _contacts: Any
 
     def __init__(
@@ -368,16 +368,6 @@ class ContactQuery(Operator):
         """Return the stages of a query; raise ValueError for a precision or type that there is none of."""
         contact_dtypes(contact_dtype)
         return plan_contacts(precision, within, gap, True, contact_dtype)
-
-    @property
-    def faces(self) -> wp.array:
-        """Return the last launch's `Result.faces`, sorted."""
-        return self._contacts.faces
-
-    @property
-    def start(self) -> wp.array:
-        """Return where the rows of each pair start."""
-        return self._contacts.start
 
     @property
     def contact_dtype(self):

@@ -134,12 +134,8 @@ class PointStage(Stage):
 
     def _find_near(self, count, posed, gap, rows):
         """Find the candidates of faces that are apart. Launches only."""
-        operator, contacts, listed, curves = (
-            self.operator,
-            self._contacts.contacts,
-            self._contacts.deferred,
-            self.curves,
-        )
+        operator, curves = self.operator, self.curves
+        contacts, listed = self._contacts.contacts, self._contacts.deferred
         warps, threads = (-(-count // share) for share in (int(near_points.CONTACTS_A_WARP), WARP_SIZE))
         inputs = [operator.batch.objects.pool, operator.pair_batch, rows, contacts, listed, curves]
         operator.launch_kernel(near_points.find_near_candidate_kernel, threads * WARP_SIZE, inputs, WARP_SIZE)
@@ -190,27 +186,17 @@ class ManifoldQuery(Operator):
     """
 
     growth = 2
-
-    _contacts: Any
+    faces: wp.array
+    start: wp.array
 
     def __init__(self, scene, pairs=None, capacity=None, precision="exact", gap=None, points=POINTS_MAX):
         self.point_max = whole_number(points, "points", 1, 64)
         stages = plan_contacts(precision, None, gap, sums=False)
-        *_, self._contacts = stages
-        found = PointStage(self._contacts, gap is not None, self.point_max)
-        self.contacts, self.manifolds, self.curves = self._contacts.contacts, found.manifolds, found.curves
+        contacts: Any = stages[-1]
+        found = PointStage(contacts, gap is not None, self.point_max)
+        self.contacts, self.manifolds, self.curves = contacts.contacts, found.manifolds, found.curves
         warn_of_winding(scene)
         super().__init__(scene, [*stages, found], pairs, capacity, "faces", sort_pairs=True)
-
-    @property
-    def faces(self) -> wp.array:
-        """Return the hits of the last launch, sorted."""
-        return self._contacts.faces
-
-    @property
-    def start(self) -> wp.array:
-        """Return where the rows of each pair start in faces and contacts."""
-        return self._contacts.start
 
     def set_pairs(self, pairs, within=None, gap=None):
         """Query other pairs from now on, as `ContactQuery.set_pairs`; there is no within."""
