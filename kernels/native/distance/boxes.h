@@ -12,10 +12,7 @@ struct NearBoxes : SlabBounds {
     typedef wp::int64 loose_longs __attribute__((vector_size(64), aligned(8)));
     typedef float loose_lanes __attribute__((vector_size(64), aligned(4)));
     typedef bool flags __attribute__((ext_vector_type(16)));
-    struct Taken {
-        const char *a, *b;
-        unsigned int used;
-    };
+    typedef Siblings Taken;
     // 16 pairs of children: bounds, items that follow, and which are in use and which are faces, a bit each.
     struct Tested {
         lanes bound;
@@ -51,11 +48,7 @@ struct NearBoxes : SlabBounds {
         return s;
     }
     Taken take(wp::int64 item) const {
-        const unsigned int x = (unsigned int)(item >> 32), y = (unsigned int)item;
-        const Taken taken = {tree_a + 32 * (wp::int64)(x & 0x7ffffffe), tree_b + 32 * (wp::int64)(y & 0x7ffffffe),
-                             pairs_in_use(item)};
-        __builtin_prefetch(taken.a);
-        __builtin_prefetch(taken.b);
+        const Taken taken = take_siblings(tree_a, tree_b, item);
         __builtin_prefetch(taken.a + slabs);
         __builtin_prefetch(taken.b + slabs);
         return taken;

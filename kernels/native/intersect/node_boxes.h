@@ -9,10 +9,7 @@ struct NodeBoxes {
     typedef float loose __attribute__((vector_size(64), aligned(16)));
     typedef int bits __attribute__((vector_size(64)));
     typedef bool flags __attribute__((ext_vector_type(16)));
-    struct Taken {
-        const char *a, *b;
-        unsigned int used;
-    };
+    typedef Siblings Taken;
     groups axes[3], sizes[3], shift, wide;  // for both children of A, then for both children of B
     const char *tree_a, *tree_b;
 
@@ -36,14 +33,7 @@ struct NodeBoxes {
         boxes.tree_b = (const char*)trees + 32 * (wp::int64)pose.node_b;
         return boxes;
     }
-    Taken take(wp::int64 item) const {
-        const unsigned int x = (unsigned int)(item >> 32), y = (unsigned int)item;
-        const Taken taken = {tree_a + 32 * (wp::int64)(x & 0x7ffffffe), tree_b + 32 * (wp::int64)(y & 0x7ffffffe),
-                             pairs_in_use(item)};
-        __builtin_prefetch(taken.a);
-        __builtin_prefetch(taken.b);
-        return taken;
-    }
+    Taken take(wp::int64 item) const { return take_siblings(tree_a, tree_b, item); }
     // The boxes of A twice each, those of B in turn: four pairs.
     static groups of_a(const groups& v) {
         return __builtin_shufflevector(v, v, 0, 1, 2, 3, 0, 1, 2, 3, 4, 5, 6, 7, 4, 5, 6, 7);

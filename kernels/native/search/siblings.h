@@ -10,3 +10,19 @@ inline unsigned int pairs_in_use(wp::int64 item) {
     const unsigned long long turned = ((unsigned long long)item << 1) | ((unsigned long long)item >> 63);
     return (unsigned int)(PAIRS_USED >> (((turned & 3) << 2) | ((turned >> 28) & 48))) & 15;
 }
+
+// The records of both siblings of A, and of B, 32 bytes each, and which of their four pairs are in use.
+struct Siblings {
+    const char *a, *b;
+    unsigned int used;
+};
+
+// Returns the siblings of an item, which the core begins to load.
+inline Siblings take_siblings(const char* tree_a, const char* tree_b, wp::int64 item) {
+    const unsigned int x = (unsigned int)(item >> 32), y = (unsigned int)item;
+    const Siblings taken = {tree_a + 32 * (wp::int64)(x & 0x7ffffffe), tree_b + 32 * (wp::int64)(y & 0x7ffffffe),
+                            pairs_in_use(item)};
+    __builtin_prefetch(taken.a);
+    __builtin_prefetch(taken.b);
+    return taken;
+}
