@@ -1,13 +1,23 @@
-"""The candidates of a pair's contacts, listed and searched by the threads of a block, on the CPU by one."""
+"""Candidates of a pair's contact points as wrenches, listed by the threads of a block, on the CPU by one.
+
+A wrench is two entries of 16 bytes, in the frame of A, for which motions are small:
+
+    127        96 95         64 63         32 31          0
+    [ separation |  normal z   |  normal y   |  normal x   ]
+    [   number   |  moment z   |  moment y   |  moment x   ]
+
+The moment is that of the normal about the middle of all candidates of the pair, over their `size`, so that rotations
+count as what they move. Separations count from the deepest candidate, if that is inside: as if both objects had first
+come apart as far as that. The number is the candidate's place among those of all contacts.
+"""
 
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.contacts.manifold import NO_DEPTH, Curves
+from warp_abtree.kernels.base.nodes import store_entry
+from warp_abtree.kernels.contacts.manifold import COLUMN_CORNERS, NO_DEPTH, Curves
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
-
-CANDIDATES = wp.constant(2)  # of each contact, numbered on from contact to contact
 
 
 @native.func_native()
@@ -23,13 +33,8 @@ def group_sync(): ...
 
 
 @native.func_native()
-def must_measure(chosen: wp.int32) -> bool:
-    """Return whether all candidates are measured against the points chosen: always on a GPU, without divergence."""
-
-
-@native.func_native()
-def greatest_of_group(x: wp.float64, item: wp.int32) -> wp.vec2d:
-    """Return the greatest number of all threads, and the item of a thread that has it, the least of several."""
+def greatest_of_group(x: wp.float64) -> wp.float64:
+    """Return the greatest number of all threads."""
 
 
 @native.func_native()
@@ -37,62 +42,99 @@ def next_place_of_group(end: wp.ref[wp.int32], flag: bool) -> wp.int32:
     """Return this thread's place in a list that ends there, of the threads whose flag is set, and move the end."""
 
 
-@wp.func
-def best_of_group(value: wp.float64, candidate: wp.int32):
-    """Return the candidate of the greatest value of all threads, the first of several, and that value."""
-    best = greatest_of_group(value, candidate)
-    return wp.int32(best[1]), best[0]
+@wp.struct
+class ObjectPose:
+    """Pose of A, and the sense in which its pair names the objects."""
+
+    rotation: wp.mat33d  # to the world
+    position: wp.vec3d  # [world units]
+    sense: wp.float64  # 1, or -1 where B is named first
+
+
+@wp.struct
+class Candidates:
+    """Candidates of a pair."""
+
+    first: wp.int32  # where its wrenches begin
+    end: wp.int32  # where they end
+    deepest: wp.float64  # depth of the deepest, NO_DEPTH where none has one [world units]
+    middle: wp.vec3d  # of their box, A's frame [world units]
+    size: wp.float64  # half of its diagonal [world units]
 
 
 @wp.func
-def list_candidates(first: wp.int32, end: wp.int32, curves: Curves):
-    """List the contacts of a pair that have candidates, in their order, where its contacts start; return its end.
-
-    Of faces that are apart a fifth has some, which every choice looks at.
-    """
-    listed, next = wp.int32(first), wp.int32(first)
-    while next < end:
-        i = next + group_lane()
-        has = i < end
-        if has:
-            has = curves.depth[i, 0] == curves.depth[i, 0] or curves.depth[i, 1] == curves.depth[i, 1]
-        place = next_place_of_group(listed, has)
-        if has:
-            curves.listed[place] = i
-        next += group_size()
-    group_sync()
-    return listed
+def has_candidate(number: wp.int32, lowest: wp.float64, curves: Curves):
+    """Return whether there is a candidate of a number that is deep enough."""
+    return curves.depth[number / COLUMN_CORNERS, number % COLUMN_CORNERS] >= lowest
 
 
 @wp.func
-def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
-    """Return the deepest candidate of those listed and its depth, NO_DEPTH where there is none."""
+def deepest_of(first: wp.int32, end: wp.int32, curves: Curves):
+    """Return the depth of the deepest candidate of some numbers, NO_DEPTH where there is none."""
     deepest = NO_DEPTH
-    best = CANDIDATES * first
-    at = first + group_lane()
-    while at < end:
-        i = curves.listed[at]
-        for k in range(CANDIDATES):
-            if curves.depth[i, k] > deepest:
-                deepest = curves.depth[i, k]
-                best = CANDIDATES * i + k
-        at += group_size()
-    return best_of_group(deepest, best)
+    number = first + group_lane()
+    while number < end:
+        if has_candidate(number, NO_DEPTH, curves):
+            deepest = wp.max(deepest, curves.depth[number / COLUMN_CORNERS, number % COLUMN_CORNERS])
+        number += group_size()
+    return greatest_of_group(deepest)
 
 
 @wp.func
-def find_outermost(first: wp.int32, end: wp.int32, least: wp.float64, along: wp.vec3d, curves: Curves):
-    """Return the candidate that reaches farthest along a direction, of those of a least depth, and how far."""
-    origin = curves.point[first, 0]
-    farthest = -wp.float64(wp.inf)
-    best = CANDIDATES * first
-    at = first + group_lane()
-    while at < end:
-        i = curves.listed[at]
-        for k in range(CANDIDATES):
-            reach = wp.dot(along, curves.point[i, k] - origin)
-            if curves.depth[i, k] >= least and reach > farthest:
-                farthest = reach
-                best = CANDIDATES * i + k
-        at += group_size()
-    return best_of_group(farthest, best)
+def list_wrenches(contacts: wp.vec2i, lowest: wp.float64, pose: ObjectPose, found: Candidates, curves: Curves):
+    """List the wrenches of a pair's candidates in the order of their numbers, and return where they end."""
+    back, zero, one = wp.transpose(pose.rotation), wp.float64(0.0), wp.float64(1.0)
+    deepest = wp.max(found.deepest, zero)
+    scale = wp.where(found.size > zero, one / found.size, zero)
+    end, base = wp.int32(found.first), COLUMN_CORNERS * contacts[0]
+    while base < COLUMN_CORNERS * contacts[1]:
+        number = base + group_lane()
+        lists = number < COLUMN_CORNERS * contacts[1]
+        if lists:
+            lists = has_candidate(number, lowest, curves)
+        place = next_place_of_group(end, lists)
+        if lists:
+            i, k = number / COLUMN_CORNERS, number % COLUMN_CORNERS
+            n = pose.sense * (back * curves.normal[i])
+            arm = (back * (curves.point[i, k] - pose.position) - found.middle) * scale
+            m = wp.cross(arm, n)
+            depth = wp.where(curves.depth[i, k] == NO_DEPTH, zero, curves.depth[i, k])
+            entry = wp.vec4(wp.float32(n[0]), wp.float32(n[1]), wp.float32(n[2]), wp.float32(deepest - depth))
+            store_entry(curves.wrench, wp.int64(2) * wp.int64(place), entry)
+            entry = wp.vec4(wp.float32(m[0]), wp.float32(m[1]), wp.float32(m[2]), wp.cast(number, wp.float32))
+            store_entry(curves.wrench, wp.int64(2) * wp.int64(place) + wp.int64(1), entry)
+        base += group_size()
+    group_sync()
+    return end
+
+
+@wp.func
+def list_candidates(contacts: wp.vec2i, shell: wp.float64, pose: ObjectPose, curves: Curves):
+    """List the candidates of a pair, deeper than minus its gap; middles of contacts where no face has a depth.
+
+    Args:
+        contacts: Where the pair's contacts begin and end.
+        shell: The gap.
+    """
+    found = Candidates()
+    first, end = COLUMN_CORNERS * contacts[0], COLUMN_CORNERS * contacts[1]
+    found.first = first
+    found.deepest = deepest_of(first, end, curves)
+    lowest = wp.where(found.deepest == NO_DEPTH, NO_DEPTH, -shell)
+    low = wp.vec3d(-wp.float64(wp.inf))
+    high = wp.vec3d(-wp.float64(wp.inf))
+    back = wp.transpose(pose.rotation)
+    number = first + group_lane()
+    while number < end:
+        if has_candidate(number, lowest, curves):
+            x = back * (curves.point[number / COLUMN_CORNERS, number % COLUMN_CORNERS] - pose.position)
+            low = wp.max(low, -x)
+            high = wp.max(high, x)
+        number += group_size()
+    for k in range(3):
+        low[k] = greatest_of_group(low[k])
+        high[k] = greatest_of_group(high[k])
+    found.middle = wp.float64(0.5) * (high - low)
+    found.size = wp.float64(0.5) * wp.length(high + low)
+    found.end = list_wrenches(contacts, lowest, pose, found, curves)
+    return found

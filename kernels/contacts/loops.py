@@ -81,13 +81,11 @@ def begin_loop_kernel(
     order_out: wp.array(dtype=wp.int32),
     key_out: wp.array(dtype=wp.int64),
     listed_total_out: wp.array(dtype=wp.int32),
-    large_total_out: wp.array(dtype=wp.int32),
 ):
     """Make each contact a loop of its own, with a key that brings contacts of one face of B together; list none yet."""
     i = wp.tid()
     if i == 0:
         listed_total_out[0] = 0
-        large_total_out[0] = 0
     order_out[i] = i
     key_out[i] = LAST_KEY
     if i < start[start.shape[0] - 1]:

@@ -21,6 +21,8 @@ LIKENESS = wp.constant(wp.float64(0.5))
 # By which part of a face's size its column is wider, so that walls that stand on its rim are inside.
 COLUMN_SLACK = wp.constant(wp.float64(2.0**-36))
 CLIPPED_CORNERS = wp.constant(8)
+# Candidates of a contact: a triangle within the column of another has so many corners at most.
+COLUMN_CORNERS = wp.constant(6)
 # Depths of candidates that there are not: the middle of the contact serves where all are so, or not even that.
 NO_DEPTH, NO_POINT = wp.constant(wp.float64(-wp.inf)), wp.constant(wp.float64(wp.nan))
 
@@ -32,12 +34,10 @@ class Curves:
     parent: wp.array(dtype=wp.int32)  # union-find forest of contacts, shape [contact]
     loop: wp.array(dtype=wp.int32)  # first contact of its loop, shape [contact]
     loop_normal: wp.array(dtype=wp.vec3d)  # at the first contact of each loop, shape [contact]
-    point: wp.array2d(dtype=wp.vec3d)  # the deepest candidate and one far from it [world units], shape [contact, 2]
-    depth: wp.array2d(dtype=wp.float64)  # [world units], or NO_DEPTH or NO_POINT, shape [contact, 2]
-    normal: wp.array(dtype=wp.vec3d)  # of both candidates, shape [contact]
-    listed: wp.array(dtype=wp.int32)  # contacts of each pair that have candidates, shape [contact]
-    nearest: wp.array2d(dtype=wp.float64)  # squared distance from points chosen, shape [contact, 2]
-    seen: wp.array(dtype=wp.int32)  # from how many of them, shape [contact]
+    point: wp.array2d(dtype=wp.vec3d)  # candidate points [world units], shape [contact, COLUMN_CORNERS]
+    depth: wp.array2d(dtype=wp.float64)  # [world units], or NO_DEPTH or NO_POINT, shape [contact, COLUMN_CORNERS]
+    normal: wp.array(dtype=wp.vec3d)  # of its candidates, shape [contact]
+    wrench: wp.array(dtype=wp.vec4)  # see `candidates`, shape [2 * COLUMN_CORNERS * contact]
 
 
 @wp.struct
@@ -100,6 +100,15 @@ def clip_column(
     return count
 
 
+@wp.struct
+class Column:
+    """The column of one face along a normal, with what lies of the other within it."""
+
+    normal: wp.vec3d  # unit, from the pair's first object to its second
+    depth: wp.float64  # how deep the deepest corner is behind the face, or NO_DEPTH
+    count: wp.int32  # corners of the polygon
+
+
 @wp.func
 def measure_column(
     corner: wp.array(dtype=wp.vec3d),
@@ -108,14 +117,18 @@ def measure_column(
     normal_b: wp.vec3d,
     first: wp.int32,
     least: wp.float64,
+    point: wp.array(dtype=wp.vec3d),
+    depth: wp.array(dtype=wp.float64),
 ):
-    """Return the depth of one face behind the other along n, its point, and a second such point far away, or NO_DEPTH.
+    """Find the part of one face within the column of the other along n: its corners, and their depths along n.
 
     Args:
-        least: Depth from which on there are points: 0, or minus the gap.
+        least: Depth from which on corners count: 0, or minus the gap.
         corner: Corners of the pair's first object at places first .. first + 2, of its second at the others.
     """
-    none = NO_DEPTH
+    column = Column()
+    column.normal = n
+    column.depth = NO_DEPTH
     facing_a = wp.dot(n, normal_a)
     facing_b = -wp.dot(n, normal_b)
     face = first
@@ -127,33 +140,16 @@ def measure_column(
         cut = first
         plane = normal_b
         facing = facing_b
-    origin = wp.vec3d()
     if facing < FACING:
-        return none, origin, none, origin
-    polygon = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.vec3d)
-    count = clip_column(corner, face, cut, n, polygon)
-    deepest = none
-    point = origin
+        return column
+    column.count = clip_column(corner, face, cut, n, point)
     i = wp.int32(0)
-    while i < count:
-        depth = wp.dot(corner[face] - polygon[i], plane) / facing
-        if depth > deepest and depth >= least:
-            deepest = depth
-            point = polygon[i]
+    while i < column.count:
+        depth[i] = wp.dot(corner[face] - point[i], plane) / facing
+        if depth[i] >= least:
+            column.depth = wp.max(column.depth, depth[i])
         i += 1
-    other = none
-    second = point
-    most = wp.float64(0.0)
-    i = wp.int32(0)
-    while i < count:
-        depth = wp.dot(corner[face] - polygon[i], plane) / facing
-        away = wp.dot(polygon[i] - point, polygon[i] - point)
-        if away > most and depth - least >= wp.float64(0.5) * (deepest - least):
-            most = away
-            other = depth
-            second = polygon[i]
-        i += 1
-    return deepest, point, other, second
+    return column
 
 
 @wp.func
@@ -161,22 +157,30 @@ def write_candidates(
     i: wp.int32,
     rotation: wp.mat33d,
     position: wp.vec3d,
-    n: wp.vec3d,
-    depths: wp.vec2d,
-    point: wp.vec3d,
-    second: wp.vec3d,
-    contacts: Contacts,
+    column: Column,
+    least: wp.float64,
+    point: wp.array(dtype=wp.vec3d),
+    depth: wp.array(dtype=wp.float64),
     curves: Curves,
 ):
-    """Write both candidates of a contact, posed to the world; where there is none its middle and an end."""
-    curves.depth[i, 0] = depths[0]
-    curves.depth[i, 1] = depths[1]
-    curves.normal[i] = rotation * n
-    curves.point[i, 0] = pose_point(rotation, position, point)
-    curves.point[i, 1] = pose_point(rotation, position, second)
-    if depths[0] == NO_DEPTH:
-        curves.point[i, 1] = contacts.p1[i]
-        curves.point[i, 0] = wp.float64(0.5) * (contacts.p0[i] + contacts.p1[i])
+    """Write the candidates of a contact, posed to the world: the corners of a column that are deep enough."""
+    curves.normal[i] = rotation * column.normal
+    for k in range(COLUMN_CORNERS):
+        curves.depth[i, k] = NO_POINT
+        if k < column.count and column.depth > NO_DEPTH:
+            if depth[k] >= least:
+                curves.depth[i, k] = depth[k]
+                curves.point[i, k] = pose_point(rotation, position, point[k])
+
+
+@wp.func
+def write_middle(i: wp.int32, contacts: Contacts, curves: Curves):
+    """Write the middle and an end of a contact as its candidates, which have no depth, with the loop's normal."""
+    curves.normal[i] = curves.loop_normal[curves.loop[i]]
+    for k in range(COLUMN_CORNERS):
+        curves.depth[i, k] = wp.where(k < 2, NO_DEPTH, NO_POINT)
+    curves.point[i, 0] = wp.float64(0.5) * (contacts.p0[i] + contacts.p1[i])
+    curves.point[i, 1] = contacts.p1[i]
 
 
 @wp.kernel
@@ -188,14 +192,14 @@ def find_candidate_kernel(
     contacts: Contacts,
     curves_inout: Curves,
 ):
-    """Find the normal and two candidate points of one contact a thread, of faces that intersect.
+    """Find the normal and the candidate points of one contact a thread, of faces that intersect.
 
     Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least; of
     both faces' normals where neither is like it and one looks the other way.
 
     Args:
-        gap: How far outside the second point may be, of faces that look at one another [world units], shape [pair]; [0]
-            for not at all.
+        gap: How far outside points may be, of faces that look at one another [world units], shape [pair]; [0] for not
+            at all.
         rows: In the order of loops, those of faces that intersect first.
     """
     if wp.tid() >= rows.start[rows.start.shape[0] - 1]:
@@ -217,9 +221,11 @@ def find_candidate_kernel(
     least = zero
     if gap.shape[0] > 0 and -wp.dot(normal_a, normal_b) >= LIKENESS:
         least = -gap[p]
-    n = back * curves_inout.loop_normal[curves_inout.loop[i]]
-    loop = n
-    depth, point, other, second = measure_column(corner, n, normal_a, normal_b, first, least)
+    loop = back * curves_inout.loop_normal[curves_inout.loop[i]]
+    point = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.vec3d)
+    depth = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.float64)
+    best = measure_column(corner, loop, normal_a, normal_b, first, least, point, depth)
+    written = bool(True)
     toward_a, toward_b = wp.dot(loop, normal_a), -wp.dot(loop, normal_b)
     toward = wp.max(toward_a, toward_b)
     # A loop that runs all round a part in another, as round a thread, has no one way out.
@@ -227,11 +233,13 @@ def find_candidate_kernel(
     for k in range(2):
         m = wp.where(k == 0, normal_a, -normal_b)
         if contrary or wp.dot(m, loop) > LIKENESS:
-            d, x, e, y = measure_column(corner, m, normal_a, normal_b, first, least)
-            if d >= zero and (depth < zero or d <= depth):
-                n = m
-                depth = d
-                point = x
-                other = e
-                second = y
-    write_candidates(i, rotation, position, n, wp.vec2d(depth, other), point, second, contacts, curves_inout)
+            other = measure_column(corner, m, normal_a, normal_b, first, least, point, depth)
+            written = other.depth >= zero and (best.depth < zero or other.depth <= best.depth)
+            if written:
+                best = other
+    if best.depth == NO_DEPTH:
+        write_middle(i, contacts, curves_inout)
+        return
+    if not written:
+        best = measure_column(corner, best.normal, normal_a, normal_b, first, least, point, depth)
+    write_candidates(i, rotation, position, best, least, point, depth, curves_inout)

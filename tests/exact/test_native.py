@@ -147,7 +147,7 @@ def reached(adjoint, found):
 
 
 MAKERS = {
-    "contacts.points": [lambda made: made.point_spreader(4)],
+    "contacts.points": [lambda made: made.point_chooser(4)],
     "intersect.dual_tree": [lambda made: made.warp_traversal(int(EXACT), False)],
     "intersect.relative_pose": [lambda made: made.relative_poses(False)],
     "intersect.simd": [lambda made: made.thread_traversal(int(EXACT))],

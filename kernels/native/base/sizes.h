@@ -144,6 +144,9 @@ constexpr double CLOSEST = 0x1p-60;
 constexpr double LEAST_SINE_SQUARED = 0x1p-40;
 constexpr int CHUNK = 32;
 
+// Twists by which contact points are chosen: one a thread of a block.
+constexpr int TWIST_COUNT = 256;
+
 // Certified errors: faces about a merge, distances of corners to them, corners of a polygon, polygons on the stack,
 // faces that cover a triangle, cuts of one, and triangles covered at once.
 constexpr int NEAR_ROOM = 64;

@@ -1,4 +1,4 @@
-// The threads of a block at work for one item, be it a warp or several. On the CPU a block is one thread.
+// The threads of a block at work for one object pair. On the CPU a block is one thread.
 #pragma once
 #include "builtin.h"
 
@@ -18,44 +18,42 @@ inline CUDA_CALLABLE wp::int32 group_lane() {
 #endif
 }
 
-inline CUDA_CALLABLE bool must_measure(wp::int32 chosen) {
-#if defined(__CUDA_ARCH__)
-    return true;  // a constant, so that the loop holds no other test: registers are short
-#else
-    return chosen <= 2;
-#endif
-}
-
 inline CUDA_CALLABLE void group_sync() {
 #if defined(__CUDA_ARCH__)
     __syncthreads();
 #endif
 }
 
-inline CUDA_CALLABLE wp::vec_t<2, wp::float64> greatest_of_group(wp::float64 x, wp::int32 item) {
+// The greatest number of all threads, and the item of a thread that has it, the least of several.
+template <class Number>
+CUDA_CALLABLE void find_greatest(Number& x, int& item) {
 #if defined(__CUDA_ARCH__)
-    __shared__ double values[32];
+    __shared__ Number values[32];
     __shared__ int items[32];
+    const int warps = blockDim.x >> 5;
     for (int step = 16; step > 0; step >>= 1) {
-        const double y = __shfl_xor_sync(0xffffffffu, x, step);
+        const Number y = __shfl_xor_sync(0xffffffffu, x, step);
         const int other = __shfl_xor_sync(0xffffffffu, item, step);
         item = y > x || (y == x && other < item) ? other : item;
         x = wp::max(x, y);
     }
-    if (blockDim.x > 32) {
-        __syncthreads();
-        if ((threadIdx.x & 31) == 0) {
-            values[threadIdx.x >> 5] = x;
-            items[threadIdx.x >> 5] = item;
-        }
-        __syncthreads();
-        for (int k = 0; k < blockDim.x >> 5; ++k) {
-            item = values[k] > x || (values[k] == x && items[k] < item) ? items[k] : item;
-            x = wp::max(x, values[k]);
-        }
+    __syncthreads();
+    if ((threadIdx.x & 31) == 0) {
+        values[threadIdx.x >> 5] = x;
+        items[threadIdx.x >> 5] = item;
+    }
+    __syncthreads();
+    for (int k = 0; k < warps; ++k) {
+        item = values[k] > x || (values[k] == x && items[k] < item) ? items[k] : item;
+        x = wp::max(x, values[k]);
     }
 #endif
-    return wp::vec_t<2, wp::float64>(x, wp::float64(item));
+}
+
+inline CUDA_CALLABLE wp::float64 greatest_of_group(wp::float64 x) {
+    int item = 0;
+    find_greatest(x, item);
+    return x;
 }
 
 inline CUDA_CALLABLE wp::int32 next_place_of_group(wp::int32& end, bool flag) {
@@ -63,17 +61,14 @@ inline CUDA_CALLABLE wp::int32 next_place_of_group(wp::int32& end, bool flag) {
 #if defined(__CUDA_ARCH__)
     __shared__ int counts[32];
     const unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    int before = __popc(votes & ((1u << (threadIdx.x & 31)) - 1u)), total = __popc(votes);
-    if (blockDim.x > 32) {
-        __syncthreads();
-        if ((threadIdx.x & 31) == 0)
-            counts[threadIdx.x >> 5] = total;
-        __syncthreads();
-        total = 0;
-        for (int k = 0; k < blockDim.x >> 5; ++k) {
-            before += k < threadIdx.x >> 5 ? counts[k] : 0;
-            total += counts[k];
-        }
+    int before = __popc(votes & ((1u << (threadIdx.x & 31)) - 1u)), total = 0;
+    __syncthreads();
+    if ((threadIdx.x & 31) == 0)
+        counts[threadIdx.x >> 5] = __popc(votes);
+    __syncthreads();
+    for (int k = 0; k < blockDim.x >> 5; ++k) {
+        before += k < threadIdx.x >> 5 ? counts[k] : 0;
+        total += counts[k];
     }
     place += before;
     end += total;

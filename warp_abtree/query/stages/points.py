@@ -50,9 +50,9 @@ import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.kernels.base.lanes import WARP_SIZE
-from warp_abtree.kernels.contacts import contact, loops, manifold, near_points
+from warp_abtree.kernels.contacts import loops, manifold, near_points
 from warp_abtree.kernels.contacts import points as point_kernels
-from warp_abtree.kernels.inside import inside_points
+from warp_abtree.kernels.inside import inside_points, nearest_contacts
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.result import Found, Result
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
@@ -60,7 +60,15 @@ from warp_abtree.query.stages.contacts import ContactStage, plan_contacts, warn_
 from warp_abtree.query.staging import first_rows
 
 POINTS_MAX = int(manifold.POINTS)
+CANDIDATES = int(manifold.COLUMN_CORNERS)
 POINT_FIELDS = {"point": wp.vec3d, "normal": wp.vec3d, "depth": wp.float64}
+
+
+def make_twists() -> np.ndarray:
+    """Return the twists by which points are chosen: random unit vectors of six components, by component, float32."""
+    # The legacy generator, whose numbers are the same for good.
+    twists = np.random.RandomState(0).normal(size=(point_kernels.TWIST_COUNT, 6))
+    return (twists / np.linalg.norm(twists, axis=1)[:, None]).T.astype(np.float32).ravel()
 
 
 class PointStage(Stage):
@@ -77,22 +85,21 @@ class PointStage(Stage):
 
     def __init__(self, contacts: ContactStage, with_gap: bool, point_max: int):
         self._contacts, self._with_gap, self.point_max = contacts, with_gap, point_max
-        self.manifolds, self.curves, self._large = manifold.Manifolds(), manifold.Curves(), contact.Deferred()
+        self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
 
     def attach(self, operator: Operator):
         """Take the operator."""
         super().attach(operator)
-        self._large.total = wp.zeros(1, dtype=wp.int32, device=operator.device)
+        self._twists = wp.array(make_twists(), dtype=wp.float32, device=operator.device)
         self._no_gap = wp.empty(0, dtype=wp.float64, device=operator.device)
 
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return what has an entry a contact or a pair."""
         curves, hits = self.curves, rooms.hits
         return [
-            *fields(curves, hits, **dict.fromkeys(("parent", "loop", "listed", "seen"), wp.int32)),
-            *fields(curves, hits, loop_normal=wp.vec3d, normal=wp.vec3d),
-            *fields(curves, (hits, 2), point=wp.vec3d, depth=wp.float64, nearest=wp.float64),
-            Array(self._large, "place", wp.int32, rooms.pairs),
+            *fields(curves, hits, parent=wp.int32, loop=wp.int32, loop_normal=wp.vec3d, normal=wp.vec3d),
+            *fields(curves, (hits, CANDIDATES), point=wp.vec3d, depth=wp.float64),
+            Array(curves, "wrench", wp.vec4, 2 * CANDIDATES * hits),
             Array(self.manifolds, "count", wp.int32, rooms.pairs, 0),
             *fields(self.manifolds, (rooms.pairs, self.point_max), **POINT_FIELDS),
         ]
@@ -106,7 +113,7 @@ class PointStage(Stage):
         start, faces, contacts, sorted_by = of.start, of.faces, of.contacts, (of.order, of.key)
         rows = manifold.Rows()
         rows.start, rows.faces, rows.order, rows.key = start, faces, *sorted_by
-        inputs = [start, faces, curves, *sorted_by, of.deferred.total, self._large.total]
+        inputs = [start, faces, curves, *sorted_by, of.deferred.total]
         launch(loops.begin_loop_kernel, count, inputs)
         self._sort_keys(count, 31 + room.bit_length())
         launch(loops.link_loop_kernel, count, [start, faces, contacts, *sorted_by, curves])
@@ -117,31 +124,27 @@ class PointStage(Stage):
         inputs = [*posed, start, faces, contacts, of.order, curves]
         launch(loops.average_loop_kernel, -(-count // WARP_SIZE) * WARP_SIZE, inputs, WARP_SIZE)
         launch(manifold.find_candidate_kernel, count, [*posed, gap, rows, contacts, curves])
-        self._spread_points([operator.batch.objects.pool, operator.pair_batch, gap, start])
+        self._choose_points([operator.batch.objects.pool, operator.pair_batch, self._twists, gap, start])
         self._add_inside_points()
 
-    def _spread_points(self, posed):
-        """Choose the points of each pair: on CUDA by a warp, of pairs with many contacts by a block. Launches only."""
-        operator, cuda, room = self.operator, self.operator.device.is_cuda, self.operator.rooms.pairs
-        largest = int(point_kernels.LARGE_PAIR) if cuda else np.iinfo(np.int32).max
-        spread = point_kernels.point_spreader(self.point_max)
-        operator.launch_warps(spread, room, [largest, *posed, self.curves, self._large, self.manifolds])
-        if cuda:
-            spread = point_kernels.large_point_spreader(self.point_max)
-            blocks, threads = min(room, operator.device.sm_count), point_kernels.LARGE_BLOCK
-            inputs = [blocks, *posed, self._large, self.curves, self.manifolds]
-            operator.launch_kernel(spread, blocks * threads, inputs, threads)
+    def _choose_points(self, posed):
+        """Choose the points of each pair. Launches only."""
+        operator, room = self.operator, self.operator.rooms.pairs
+        block = point_kernels.TWIST_COUNT if operator.device.is_cuda else 1
+        chooser = point_kernels.point_chooser(self.point_max)
+        operator.launch_kernel(chooser, room * block, [*posed, self.curves, self.manifolds], point_kernels.TWIST_COUNT)
 
     def _find_near(self, count, posed, gap, rows):
         """Find the candidates of faces that are apart. Launches only."""
         operator, curves = self.operator, self.curves
         contacts, listed = self._contacts.contacts, self._contacts.deferred
-        warps, threads = (-(-count // share) for share in (int(near_points.CONTACTS_A_WARP), WARP_SIZE))
+        threads = -(-count // WARP_SIZE)
         inputs = [operator.batch.objects.pool, operator.pair_batch, rows, contacts, listed, curves]
         operator.launch_kernel(near_points.find_near_candidate_kernel, threads * WARP_SIZE, inputs, WARP_SIZE)
         inputs = [*posed, gap, rows, contacts, listed, curves]
         operator.launch_kernel(near_points.find_facing_candidate_kernel, count, inputs, WARP_SIZE)
-        operator.launch_warps(near_points.keep_nearest_kernel, warps, [*posed, rows, contacts, curves])
+        inputs = [*posed, rows, contacts, curves]
+        operator.launch_kernel(nearest_contacts.keep_nearest_kernel, count, inputs, WARP_SIZE)
 
     def _add_inside_points(self):
         """Add points of what is inside, where there are solids. Launches only."""

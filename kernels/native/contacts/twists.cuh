@@ -1,0 +1,126 @@
+// Choice of contact points by violated twists: a twist a thread of a block on a GPU, 16 in a vector on the CPU.
+#pragma once
+#include "builtin.h"
+#include "base/float32.h"
+#include "base/sizes.h"
+#include "contacts/groups.cuh"
+
+struct TwistChoice {
+    typedef Float32 F;
+    typedef F::lanes lanes;
+    typedef F::Point Point;
+#if defined(__CUDA_ARCH__)
+    typedef int integers;
+    static constexpr int LANES = 1, GROUPS = 1;
+    static CUDA_CALLABLE lanes load(const float* from) { return from[threadIdx.x]; }
+    static CUDA_CALLABLE bool any(bool flag) { return flag; }
+    template <class Number>
+    static CUDA_CALLABLE Number get_lane(const Number& v, int) {
+        return v;
+    }
+#else
+    typedef F::bits integers;
+    typedef float loose __attribute__((vector_size(64), aligned(4)));
+    static constexpr int LANES = 16, GROUPS = TWIST_COUNT / 16;
+    static lanes load(const float* from) { return *(const loose*)from; }
+    static bool any(const F::bits& flags) { return F::to_mask(flags) != 0; }
+    static float get_lane(const lanes& v, int k) { return v[k]; }
+    static int get_lane(const integers& v, int k) { return v[k]; }
+#endif
+    struct Twists {
+        Point linear, angular;
+        lanes stop;         // part of the motion that the points chosen allow
+        lanes worst;        // how deep it takes a candidate then
+        integers candidate;  // the first that goes so deep
+    };
+    // A candidate: normal, separation; moment of the normal, and its number.
+    struct Wrench {
+        Point normal, moment;
+        lanes separation;
+    };
+    const wp::vec_t<4, float>* wrenches;
+    int first, end;
+
+    CUDA_CALLABLE Wrench get(int c) const {
+        const wp::vec_t<4, float>&n = wrenches[2 * c], &m = wrenches[2 * c + 1];
+        const lanes zero = {};
+        return Wrench{{zero + n[0], zero + n[1], zero + n[2]}, {zero + m[0], zero + m[1], zero + m[2]}, zero + n[3]};
+    }
+    static CUDA_CALLABLE lanes rate_of(const Twists& t, const Wrench& c) {
+        return F::dot(t.linear, c.normal) + F::dot(t.angular, c.moment);
+    }
+    CUDA_CALLABLE void find_worst(Twists& t) const {
+        t.worst = lanes{} - 0x1p126f;
+        for (int k = first; k < end; ++k) {
+            const Wrench c = get(k);
+            const lanes depth = F::fuse(-rate_of(t, c), t.stop, -c.separation);
+            const auto deeper = depth > t.worst;
+            t.worst = deeper ? depth : t.worst;
+            t.candidate = deeper ? integers{} + k : t.candidate;
+        }
+    }
+    // Lets a candidate stop the twists that go against it.
+    CUDA_CALLABLE void block(Twists& t, const Wrench& c) const {
+        const lanes rate = rate_of(t, c), closing = -rate;
+        const auto stops = (closing > 0x1p-20f) & (c.separation < t.stop * closing);
+        t.stop = stops ? c.separation / closing : t.stop;
+        if (any(stops))
+            find_worst(t);
+    }
+};
+
+template <class Array>
+CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec_t<4, wp::float32>> wrenches, wp::int32 first,
+                                         wp::int32 end, wp::array_t<wp::float32> twists, wp::float32 limit,
+                                         wp::float32 tolerance, wp::float32 deep, wp::int32 most, Array chosen) {
+    typedef TwistChoice T;
+    const T choice = {wrenches.data, first, end};
+    T::Twists twist[T::GROUPS];
+    const T::lanes zero = {};
+    for (int g = 0; g < T::GROUPS; ++g) {
+        T::lanes x[6];
+        for (int k = 0; k < 6; ++k)
+            x[k] = T::load(twists.data + TWIST_COUNT * k + T::LANES * g);
+        twist[g].linear = T::Point{x[0], x[1], x[2]};
+        twist[g].angular = T::Point{x[3], x[4], x[5]};
+        twist[g].stop = zero + limit;
+        choice.find_worst(twist[g]);
+    }
+    // The nearest candidate, the first of several, which must be among those chosen or about as near as one.
+    float nearest = -0x1p126f, reached = 0x1p126f;
+    int nearest_at = first;
+    for (int k = first + group_lane(); k < end; k += group_size())
+        if (-wrenches.data[2 * k][3] > nearest) {
+            nearest = -wrenches.data[2 * k][3];
+            nearest_at = k;
+        }
+    find_greatest(nearest, nearest_at);
+    int count = 0;
+    while (count < most) {
+        float depth = -0x1p126f;
+        int at = first;
+        for (int g = 0; g < T::GROUPS; ++g) {
+            for (int k = 0; k < T::LANES; ++k) {
+                const float worst = T::get_lane(twist[g].worst, k);
+                const int candidate = T::get_lane(twist[g].candidate, k);
+                if (worst > depth || (worst == depth && candidate < at)) {
+                    depth = worst;
+                    at = candidate;
+                }
+            }
+        }
+        find_greatest(depth, at);
+        const bool is_last = count + 1 == most || depth <= tolerance;
+        if (is_last && reached > deep)
+            at = nearest_at;
+        else if (depth <= tolerance)
+            break;
+        chosen.data[count++] = at;
+        const float separation = wrenches.data[2 * at][3];
+        reached = separation < reached ? separation : reached;
+        const T::Wrench c = choice.get(at);
+        for (int g = 0; g < T::GROUPS; ++g)
+            choice.block(twist[g], c);
+    }
+    return count;
+}
