@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.nodes import store_entry
-from warp_abtree.kernels.contacts.manifold import COLUMN_CORNERS, NO_DEPTH, Curves
+from warp_abtree.kernels.contacts.manifold import COLUMN_CORNERS, NO_DEPTH, Witnesses
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -63,25 +63,25 @@ class Candidates:
 
 
 @wp.func
-def has_candidate(number: wp.int32, lowest: wp.float64, curves: Curves):
+def has_candidate(number: wp.int32, lowest: wp.float64, witnesses: Witnesses):
     """Return whether there is a candidate of a number that is deep enough."""
-    return curves.depth[number / COLUMN_CORNERS, number % COLUMN_CORNERS] >= lowest
+    return witnesses.depth[number / COLUMN_CORNERS, number % COLUMN_CORNERS] >= lowest
 
 
 @wp.func
-def deepest_of(first: wp.int32, end: wp.int32, curves: Curves):
+def deepest_of(first: wp.int32, end: wp.int32, witnesses: Witnesses):
     """Return the depth of the deepest candidate of some numbers, NO_DEPTH where there is none."""
     deepest = NO_DEPTH
     number = first + group_lane()
     while number < end:
-        if has_candidate(number, NO_DEPTH, curves):
-            deepest = wp.max(deepest, curves.depth[number / COLUMN_CORNERS, number % COLUMN_CORNERS])
+        if has_candidate(number, NO_DEPTH, witnesses):
+            deepest = wp.max(deepest, witnesses.depth[number / COLUMN_CORNERS, number % COLUMN_CORNERS])
         number += group_size()
     return greatest_of_group(deepest)
 
 
 @wp.func
-def list_wrenches(contacts: wp.vec2i, lowest: wp.float64, pose: ObjectPose, found: Candidates, curves: Curves):
+def list_wrenches(contacts: wp.vec2i, lowest: wp.float64, pose: ObjectPose, found: Candidates, witnesses: Witnesses):
     """List the wrenches of a pair's candidates in the order of their numbers, and return where they end."""
     back, zero, one = wp.transpose(pose.rotation), wp.float64(0.0), wp.float64(1.0)
     deepest = wp.max(found.deepest, zero)
@@ -91,25 +91,25 @@ def list_wrenches(contacts: wp.vec2i, lowest: wp.float64, pose: ObjectPose, foun
         number = base + group_lane()
         lists = number < COLUMN_CORNERS * contacts[1]
         if lists:
-            lists = has_candidate(number, lowest, curves)
+            lists = has_candidate(number, lowest, witnesses)
         place = next_place_of_group(end, lists)
         if lists:
             i, k = number / COLUMN_CORNERS, number % COLUMN_CORNERS
-            n = pose.sense * (back * curves.normal[i])
-            arm = (back * (curves.point[i, k] - pose.position) - found.middle) * scale
+            n = pose.sense * (back * witnesses.normal[i])
+            arm = (back * (witnesses.point[i, k] - pose.position) - found.middle) * scale
             m = wp.cross(arm, n)
-            depth = wp.where(curves.depth[i, k] == NO_DEPTH, zero, curves.depth[i, k])
+            depth = wp.where(witnesses.depth[i, k] == NO_DEPTH, zero, witnesses.depth[i, k])
             entry = wp.vec4(wp.float32(n[0]), wp.float32(n[1]), wp.float32(n[2]), wp.float32(deepest - depth))
-            store_entry(curves.wrench, wp.int64(2) * wp.int64(place), entry)
+            store_entry(witnesses.wrench, wp.int64(2) * wp.int64(place), entry)
             entry = wp.vec4(wp.float32(m[0]), wp.float32(m[1]), wp.float32(m[2]), wp.cast(number, wp.float32))
-            store_entry(curves.wrench, wp.int64(2) * wp.int64(place) + wp.int64(1), entry)
+            store_entry(witnesses.wrench, wp.int64(2) * wp.int64(place) + wp.int64(1), entry)
         base += group_size()
     group_sync()
     return end
 
 
 @wp.func
-def list_candidates(contacts: wp.vec2i, shell: wp.float64, pose: ObjectPose, curves: Curves):
+def list_candidates(contacts: wp.vec2i, shell: wp.float64, pose: ObjectPose, witnesses: Witnesses):
     """List the candidates of a pair, deeper than minus its gap; middles of contacts where no face has a depth.
 
     Args:
@@ -119,15 +119,15 @@ def list_candidates(contacts: wp.vec2i, shell: wp.float64, pose: ObjectPose, cur
     found = Candidates()
     first, end = COLUMN_CORNERS * contacts[0], COLUMN_CORNERS * contacts[1]
     found.first = first
-    found.deepest = deepest_of(first, end, curves)
+    found.deepest = deepest_of(first, end, witnesses)
     lowest = wp.where(found.deepest == NO_DEPTH, NO_DEPTH, -shell)
     low = wp.vec3d(-wp.float64(wp.inf))
     high = wp.vec3d(-wp.float64(wp.inf))
     back = wp.transpose(pose.rotation)
     number = first + group_lane()
     while number < end:
-        if has_candidate(number, lowest, curves):
-            x = back * (curves.point[number / COLUMN_CORNERS, number % COLUMN_CORNERS] - pose.position)
+        if has_candidate(number, lowest, witnesses):
+            x = back * (witnesses.point[number / COLUMN_CORNERS, number % COLUMN_CORNERS] - pose.position)
             low = wp.max(low, -x)
             high = wp.max(high, x)
         number += group_size()
@@ -136,5 +136,5 @@ def list_candidates(contacts: wp.vec2i, shell: wp.float64, pose: ObjectPose, cur
         high[k] = greatest_of_group(high[k])
     found.middle = wp.float64(0.5) * (high - low)
     found.size = wp.float64(0.5) * wp.length(high + low)
-    found.end = list_wrenches(contacts, lowest, pose, found, curves)
+    found.end = list_wrenches(contacts, lowest, pose, found, witnesses)
     return found

@@ -1,8 +1,7 @@
 """Contact loops of an object pair, joined by union-find, and their normals.
 
 A loop is a set of contacts that faces link: two contacts of a pair that share a face of either object are of one loop,
-unless the other faces are of two walls that face each other, as of a slot that the face spans. Faces that are apart,
-nearer than a gap, are of no loop.
+unless the other faces are of two walls that face each other, as of a slot that the face spans.
 """
 
 import warp as wp
@@ -11,7 +10,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import LAST_KEY, Trees
 from warp_abtree.kernels.base.lanes import add_in_order, count_lanes, first_lane, six_numbers, warp_lane, warp_size
 from warp_abtree.kernels.base.poses import PairBatch
-from warp_abtree.kernels.contacts.contact import Contacts, have_crossed, pair_direction
+from warp_abtree.kernels.contacts.contact import Contacts, pair_direction
 from warp_abtree.kernels.contacts.manifold import Curves
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
@@ -80,12 +79,9 @@ def begin_loop_kernel(
     curves_out: Curves,
     order_out: wp.array(dtype=wp.int32),
     key_out: wp.array(dtype=wp.int64),
-    listed_total_out: wp.array(dtype=wp.int32),
 ):
-    """Make each contact a loop of its own, with a key that brings contacts of one face of B together; list none yet."""
+    """Make each contact a loop of its own, with a key that brings contacts of one face of B together."""
     i = wp.tid()
-    if i == 0:
-        listed_total_out[0] = 0
     order_out[i] = i
     key_out[i] = LAST_KEY
     if i < start[start.shape[0] - 1]:
@@ -107,27 +103,24 @@ def link_loop_kernel(
     last = start[start.shape[0] - 1]
     if i + 1 >= last:
         return
-    if have_crossed(contacts, i):
-        j = i + 1
-        while j < last and faces[j][0] == faces[i][0] and faces[j][1] == faces[i][1]:
-            if have_crossed(contacts, j) and not are_across(contacts, contacts.normal_b, i, j):
-                unite_roots(curves_inout.parent, i, j)
-                j = last
-            j += 1
+    j = i + 1
+    while j < last and faces[j][0] == faces[i][0] and faces[j][1] == faces[i][1]:
+        if not are_across(contacts, contacts.normal_b, i, j):
+            unite_roots(curves_inout.parent, i, j)
+            j = last
+        j += 1
     k = order[i]
-    if have_crossed(contacts, k):
-        j = i + 1
-        while j < last and key[j] == key[i]:
-            if have_crossed(contacts, order[j]) and not are_across(contacts, contacts.normal_a, k, order[j]):
-                unite_roots(curves_inout.parent, k, order[j])
-                j = last
-            j += 1
+    j = i + 1
+    while j < last and key[j] == key[i]:
+        if not are_across(contacts, contacts.normal_a, k, order[j]):
+            unite_roots(curves_inout.parent, k, order[j])
+            j = last
+        j += 1
 
 
 @wp.kernel
 def name_loop_kernel(
     start: wp.array(dtype=wp.int32),
-    contacts: Contacts,
     curves_inout: Curves,
     order_out: wp.array(dtype=wp.int32),
     key_out: wp.array(dtype=wp.int64),
@@ -139,8 +132,7 @@ def name_loop_kernel(
     if i < start[start.shape[0] - 1]:
         root = find_root(curves_inout.parent, i)
         curves_inout.loop[i] = root
-        if have_crossed(contacts, i):
-            key_out[i] = wp.int64(root)
+        key_out[i] = wp.int64(root)
 
 
 @wp.struct
@@ -217,7 +209,7 @@ def average_loop_kernel(
     k = wp.tid()
     begins = k < last
     if begins:
-        begins = curves_inout.loop[order[k]] == order[k] and have_crossed(contacts, order[k])
+        begins = curves_inout.loop[order[k]] == order[k]
     lane = first_lane(begins)
     while lane < warp_size():
         first = k - warp_lane() + lane

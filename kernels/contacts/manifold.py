@@ -4,12 +4,14 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
-from warp_abtree.kernels.base.poses import PairBatch, pose_point
-from warp_abtree.kernels.contacts.contact import Contacts, have_crossed
+from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
+from warp_abtree.kernels.contacts.contact import Contacts
+from warp_abtree.kernels.contacts.slots import HEADERS, Slots, WitnessRows, offer_point
+from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 from warp_abtree.kernels.triangle.corners import load_corners
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
-wp.set_module_options(native.options())
+wp.set_module_options(native.options(*HEADERS))
 
 POINTS = wp.constant(8)
 """Points that stand for a pair, unless told otherwise."""
@@ -25,6 +27,7 @@ CLIPPED_CORNERS = wp.constant(8)
 COLUMN_CORNERS = wp.constant(6)
 # Depths of candidates that there are not: the middle of the contact serves where all are so, or not even that.
 NO_DEPTH, NO_POINT = wp.constant(wp.float64(-wp.inf)), wp.constant(wp.float64(wp.nan))
+NO_DEPTH_SEPARATION = wp.constant(wp.float32(2.0**60))  # more than any, in offers to slots
 
 
 @wp.struct
@@ -34,20 +37,17 @@ class Curves:
     parent: wp.array(dtype=wp.int32)  # union-find forest of contacts, shape [contact]
     loop: wp.array(dtype=wp.int32)  # first contact of its loop, shape [contact]
     loop_normal: wp.array(dtype=wp.vec3d)  # at the first contact of each loop, shape [contact]
-    point: wp.array2d(dtype=wp.vec3d)  # candidate points [world units], shape [contact, COLUMN_CORNERS]
-    depth: wp.array2d(dtype=wp.float64)  # [world units], or NO_DEPTH or NO_POINT, shape [contact, COLUMN_CORNERS]
-    normal: wp.array(dtype=wp.vec3d)  # of its candidates, shape [contact]
-    wrench: wp.array(dtype=wp.vec4)  # see `candidates`, shape [2 * COLUMN_CORNERS * contact]
 
 
 @wp.struct
-class Rows:
-    """Contacts of all pairs in two orders."""
+class Witnesses:
+    """Candidate points of all pairs, of the contacts that slots keep, world frame."""
 
-    start: wp.array(dtype=wp.int32)  # where those of each pair start, shape [pair + 1]
-    faces: wp.array(dtype=wp.vec3i)  # pair and faces, in the order of the first object's faces, shape [contact]
-    order: wp.array(dtype=wp.int32)  # contacts by their keys, shape [contact]
-    key: wp.array(dtype=wp.int64)  # `contact_key` of each in that order, or its loop, shape [contact]
+    normal: wp.array(dtype=wp.vec3d)  # unit, from the pair's first object to its second, shape [witness]
+    point: wp.array2d(dtype=wp.vec3d)  # [world units], shape [witness, COLUMN_CORNERS]
+    depth: wp.array2d(dtype=wp.float64)  # [world units], NO_DEPTH or NO_POINT, shape [witness, COLUMN_CORNERS]
+    unsure: wp.array(dtype=wp.int32)  # whether another face may be nearer, 0 or 1, shape [witness]
+    wrench: wp.array(dtype=wp.vec4)  # see `candidates`, shape [2 * COLUMN_CORNERS * witness]
 
 
 @wp.struct
@@ -154,76 +154,83 @@ def measure_column(
 
 @wp.func
 def write_candidates(
-    i: wp.int32,
+    w: wp.int32,
     rotation: wp.mat33d,
     position: wp.vec3d,
     column: Column,
     least: wp.float64,
     point: wp.array(dtype=wp.vec3d),
     depth: wp.array(dtype=wp.float64),
-    curves: Curves,
+    witnesses: Witnesses,
 ):
-    """Write the candidates of a contact, posed to the world: the corners of a column that are deep enough."""
-    curves.normal[i] = rotation * column.normal
+    """Write the candidates of a witness, posed to the world: the corners of a column that are deep enough."""
+    witnesses.normal[w] = rotation * column.normal
     for k in range(COLUMN_CORNERS):
-        curves.depth[i, k] = NO_POINT
+        witnesses.depth[w, k] = NO_POINT
         if k < column.count and column.depth > NO_DEPTH:
             if depth[k] >= least:
-                curves.depth[i, k] = depth[k]
-                curves.point[i, k] = pose_point(rotation, position, point[k])
+                witnesses.depth[w, k] = depth[k]
+                witnesses.point[w, k] = pose_point(rotation, position, point[k])
 
 
 @wp.func
-def write_middle(i: wp.int32, contacts: Contacts, curves: Curves):
-    """Write the middle and an end of a contact as its candidates, which have no depth, with the loop's normal."""
-    curves.normal[i] = curves.loop_normal[curves.loop[i]]
+def write_middle(w: wp.int32, i: wp.int32, n: wp.vec3d, contacts: Contacts, witnesses: Witnesses):
+    """Write the middle and an end of contact i as candidates, which have no depth."""
+    witnesses.normal[w] = n
     for k in range(COLUMN_CORNERS):
-        curves.depth[i, k] = wp.where(k < 2, NO_DEPTH, NO_POINT)
-    curves.point[i, 0] = wp.float64(0.5) * (contacts.p0[i] + contacts.p1[i])
-    curves.point[i, 1] = contacts.p1[i]
+        witnesses.depth[w, k] = wp.where(k < 2, NO_DEPTH, NO_POINT)
+    witnesses.point[w, 0] = wp.float64(0.5) * (contacts.p0[i] + contacts.p1[i])
+    witnesses.point[w, 1] = contacts.p1[i]
 
 
-@wp.kernel
-def find_candidate_kernel(
+@wp.struct
+class Crossing:
+    """A contact of faces that cross, to find its candidates."""
+
+    i: wp.int32  # its place among contacts
+    a: wp.int32  # object A of its pair
+    faces: wp.vec3i  # pair, face of its first object, face of its second
+    least: wp.float64  # depth from which on there are candidates: 0, or minus the gap where faces look at one another
+
+
+@wp.func
+def load_crossing(i: wp.int32, batch: PairBatch, gap: wp.array(dtype=wp.float64), faces: wp.vec3i, contacts: Contacts):
+    """Return a contact.
+
+    Args:
+        gap: Of each pair [world units], or [0] for none.
+    """
+    crossing = Crossing()
+    crossing.i = i
+    crossing.faces = faces
+    crossing.a = wp.min(batch.pairs[faces[0]][0], batch.pairs[faces[0]][1])
+    if gap.shape[0] > 0 and -wp.dot(contacts.normal_a[i], contacts.normal_b[i]) >= LIKENESS:
+        crossing.least = -gap[faces[0]]
+    return crossing
+
+
+@wp.func
+def measure_crossing(
+    crossing: Crossing,
     trees: Trees,
-    batch: PairBatch,
-    gap: wp.array(dtype=wp.float64),
-    rows: Rows,
+    pose: PairPose,
     contacts: Contacts,
-    curves_inout: Curves,
+    curves: Curves,
+    point: wp.array(dtype=wp.vec3d),
+    depth: wp.array(dtype=wp.float64),
 ):
-    """Find the normal and the candidate points of one contact a thread, of faces that intersect.
+    """Find the normal and the candidate points of a contact of faces that cross, in A's frame.
 
     Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least; of
     both faces' normals where neither is like it and one looks the other way.
-
-    Args:
-        gap: How far outside points may be, of faces that look at one another [world units], shape [pair]; [0] for not
-            at all.
-        rows: In the order of loops, those of faces that intersect first.
     """
-    if wp.tid() >= rows.start[rows.start.shape[0] - 1]:
-        return
-    i = rows.order[wp.tid()]
-    if not have_crossed(contacts, i):
-        return
-    p = rows.faces[i][0]
-    swapped = batch.poses[p].swapped
-    a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    load_corners(trees, batch.poses[p], rows.faces[i][1 + swapped], rows.faces[i][2 - swapped], corner)
-    rotation, position = trees.objects.rotation[a], trees.objects.position[a]
-    back = wp.transpose(rotation)
-    normal_a = back * contacts.normal_a[i]
-    normal_b = back * contacts.normal_b[i]
-    first = 3 * swapped
-    zero = wp.float64(0.0)
-    least = zero
-    if gap.shape[0] > 0 and -wp.dot(normal_a, normal_b) >= LIKENESS:
-        least = -gap[p]
-    loop = back * curves_inout.loop_normal[curves_inout.loop[i]]
-    point = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.vec3d)
-    depth = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.float64)
+    load_corners(trees, pose, crossing.faces[1 + pose.swapped], crossing.faces[2 - pose.swapped], corner)
+    back = wp.transpose(trees.objects.rotation[crossing.a])
+    normal_a = back * contacts.normal_a[crossing.i]
+    normal_b = back * contacts.normal_b[crossing.i]
+    first, zero, least = 3 * pose.swapped, wp.float64(0.0), crossing.least
+    loop = back * curves.loop_normal[curves.loop[crossing.i]]
     best = measure_column(corner, loop, normal_a, normal_b, first, least, point, depth)
     written = bool(True)
     toward_a, toward_b = wp.dot(loop, normal_a), -wp.dot(loop, normal_b)
@@ -237,9 +244,82 @@ def find_candidate_kernel(
             written = other.depth >= zero and (best.depth < zero or other.depth <= best.depth)
             if written:
                 best = other
-    if best.depth == NO_DEPTH:
-        write_middle(i, contacts, curves_inout)
-        return
-    if not written:
+    if not written and best.depth > NO_DEPTH:
         best = measure_column(corner, best.normal, normal_a, normal_b, first, least, point, depth)
-    write_candidates(i, rotation, position, best, least, point, depth, curves_inout)
+    return best
+
+
+@wp.kernel
+def offer_crossing_kernel(
+    trees: Trees,
+    batch: PairBatch,
+    gap: wp.array(dtype=wp.float64),
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    order: wp.array(dtype=wp.int32),
+    contacts: Contacts,
+    curves: Curves,
+    hits: Hits,
+    slots_inout: Slots,
+):
+    """Offer the candidates of one contact of faces that cross a thread to the slots of its pair.
+
+    Args:
+        gap: How far outside points may be, of faces that look at one another [world units], shape [pair]; [0] for not
+            at all.
+        start, faces, order: Contacts of pairs, as for `loops`, in the order of loops.
+    """
+    if wp.tid() >= start[start.shape[0] - 1]:
+        return
+    i = order[wp.tid()]
+    crossing = load_crossing(i, batch, gap, faces[i], contacts)
+    p = faces[i][0]
+    pose = batch.poses[p]
+    point = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.vec3d)
+    depth = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.float64)
+    column = measure_crossing(crossing, trees, pose, contacts, curves, point, depth)
+    sense = wp.where(pose.swapped != 0, wp.float64(-1.0), wp.float64(1.0))
+    n = wp.vec3(sense * column.normal)
+    weight, directions = slots_inout.measures[p][1], slots_inout.directions
+    if column.depth == NO_DEPTH:
+        # Behind whatever has a depth.
+        offer_point(n, wp.vec3(), NO_DEPTH_SEPARATION, weight, directions, i, p, hits.apart, slots_inout.key)
+        return
+    centre = trees.models.centre[trees.states.model[trees.objects.state[crossing.a]]]
+    for k in range(column.count):
+        if depth[k] >= crossing.least:
+            x, s = wp.vec3((point[k] - centre) * pose.scale), wp.float32(-depth[k] * pose.scale)
+            offer_point(n, x, s, weight, directions, i, p, hits.apart, slots_inout.key)
+
+
+@wp.kernel
+def find_crossing_kernel(
+    trees: Trees,
+    batch: PairBatch,
+    gap: wp.array(dtype=wp.float64),
+    faces: wp.array(dtype=wp.vec3i),
+    contacts: Contacts,
+    curves: Curves,
+    hits: Hits,
+    rows: WitnessRows,
+    witnesses_out: Witnesses,
+):
+    """Find the normal and the candidate points of one witness of faces that cross a thread, or that there is none."""
+    w = wp.tid()
+    if w >= wp.min(hits.witness_total[0], rows.item.shape[0]):
+        return
+    item = rows.item[w]
+    if item[0] < 0:
+        for k in range(COLUMN_CORNERS):
+            witnesses_out.depth[w, k] = NO_POINT
+    if item[0] < 0 or item[0] >= NEAR_BIT:
+        return
+    crossing = load_crossing(item[1], batch, gap, faces[item[1]], contacts)
+    point = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.vec3d)
+    depth = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.float64)
+    column = measure_crossing(crossing, trees, batch.poses[item[0]], contacts, curves, point, depth)
+    rotation, position = trees.objects.rotation[crossing.a], trees.objects.position[crossing.a]
+    if column.depth == NO_DEPTH:
+        write_middle(w, crossing.i, rotation * column.normal, contacts, witnesses_out)
+    else:
+        write_candidates(w, rotation, position, column, crossing.least, point, depth, witnesses_out)

@@ -10,23 +10,24 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, Trees
-from warp_abtree.kernels.base.counters import reserve_slot
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
-from warp_abtree.kernels.contacts.contact import Contacts, Deferred, have_crossed
+from warp_abtree.kernels.contacts.contact import Contacts, contact_objects
 from warp_abtree.kernels.contacts.manifold import (
     CLIPPED_CORNERS,
     COLUMN_CORNERS,
     NO_DEPTH,
     NO_POINT,
-    Curves,
-    Rows,
+    Witnesses,
     measure_column,
     write_candidates,
 )
+from warp_abtree.kernels.contacts.separation import write_near_contact
+from warp_abtree.kernels.contacts.slots import HEADERS, WitnessRows
+from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK, Hits
 from warp_abtree.kernels.triangle.corners import load_corners
 from warp_abtree.kernels.triangle.distance import largest_coordinate
 
-wp.set_module_options(native.options("base/counters.cuh"))
+wp.set_module_options(native.options(*HEADERS))
 
 # A face's normal serves where the other face looks against it within 60 degrees.
 OPPOSED_LEAST = wp.constant(wp.float64(0.5))
@@ -34,15 +35,13 @@ OPPOSED_LEAST = wp.constant(wp.float64(0.5))
 ALIKE = wp.constant(wp.float64(2.0**-10))
 # Cosine between a face's normal and the direction of the distance under which the gap differs by more than `ALIKE`.
 ALONG = wp.constant(wp.float64(0.998))
-# In place of the loop of a contact whose candidates count only if no other face is nearer.
-NEAREST_ONLY = wp.constant(wp.int32(-1))
 # Part of the size of faces that a gap along a normal errs by.
 COLUMN_ROUNDING = wp.constant(wp.float64(2.0**-46))
 
 
 @wp.func
 def write_nearest_points(
-    i: wp.int32, objects: ObjectPool, a: wp.int32, pose: PairPose, contacts: Contacts, curves: Curves
+    w: wp.int32, objects: ObjectPool, a: wp.int32, pose: PairPose, contacts: Contacts, witnesses: Witnesses
 ):
     """Write the middle of the nearest points of a contact as its candidate, where both faces look at one another.
 
@@ -51,46 +50,17 @@ def write_nearest_points(
     """
     rotation, position = objects.rotation[a], objects.position[a]
     back = wp.transpose(rotation)
-    n = contacts.normal[i]
-    ahead = wp.dot(n, contacts.normal_a[i]) > wp.float64(0.0) and wp.dot(n, contacts.normal_b[i]) < wp.float64(0.0)
+    n = contacts.normal[w]
+    ahead = wp.dot(n, contacts.normal_a[w]) > wp.float64(0.0) and wp.dot(n, contacts.normal_b[w]) < wp.float64(0.0)
     for k in range(COLUMN_CORNERS):
-        curves.depth[i, k] = NO_POINT
-    curves.normal[i] = n
-    curves.loop[i] = i
+        witnesses.depth[w, k] = NO_POINT
+    witnesses.normal[w] = n
     if ahead:
-        curves.loop[i] = NEAREST_ONLY
-        first = back * (contacts.p0[i] - position) * pose.scale
-        middle = (first + back * (contacts.p1[i] - position) * pose.scale) * (wp.float64(0.5) / pose.scale)
-        curves.depth[i, 0] = -contacts.separation[i]
-        curves.point[i, 0] = pose_point(rotation, position, middle)
-
-
-@wp.kernel
-def find_near_candidate_kernel(
-    objects: ObjectPool, batch: PairBatch, rows: Rows, contacts: Contacts, facing_inout: Deferred, curves_inout: Curves
-):
-    """Find the candidate of one contact of faces that are apart a thread: their nearest points; or list it.
-
-    Where both faces look at one another and the distance may be along the normal of either, it is listed. A gap along
-    a normal is that of two points of faces, which are convex: points farther apart than the nearest by a fraction e at
-    most are so in a direction whose cosine with that of the distance is at least 1 / (1 + e).
-    """
-    i = wp.tid()
-    listed = bool(False)
-    apart = i < rows.start[rows.start.shape[0] - 1]
-    if apart:
-        apart = not have_crossed(contacts, i)
-    if apart:
-        n, normal_a, normal_b = contacts.normal[i], contacts.normal_a[i], contacts.normal_b[i]
-        along = wp.max(wp.abs(wp.dot(n, normal_a)), wp.abs(wp.dot(n, normal_b)))
-        listed = -wp.dot(normal_a, normal_b) >= OPPOSED_LEAST and along >= ALONG
-        if not listed:
-            p = rows.faces[i][0]
-            a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
-            write_nearest_points(i, objects, a, batch.poses[p], contacts, curves_inout)
-    slot = reserve_slot(facing_inout.total, listed)
-    if listed:
-        facing_inout.place[slot] = i
+        witnesses.unsure[w] = 1
+        first = back * (contacts.p0[w] - position) * pose.scale
+        middle = (first + back * (contacts.p1[w] - position) * pose.scale) * (wp.float64(0.5) / pose.scale)
+        witnesses.depth[w, 0] = -contacts.separation[w]
+        witnesses.point[w, 0] = pose_point(rotation, position, middle)
 
 
 @wp.func
@@ -102,51 +72,88 @@ def faces_size(corner: wp.array(dtype=wp.vec3d)):
     return size
 
 
-@wp.kernel
-def find_facing_candidate_kernel(
+@wp.func
+def write_facing(
+    w: wp.int32,
+    gap: wp.float64,
     trees: Trees,
-    batch: PairBatch,
-    gap: wp.array(dtype=wp.float64),
-    rows: Rows,
+    a: wp.int32,
+    pose: PairPose,
+    faces: wp.vec3i,
     contacts: Contacts,
-    facing: Deferred,
-    curves_inout: Curves,
+    witnesses: Witnesses,
 ):
-    """Find the normal and the candidate points of one listed contact of faces that are apart a thread.
+    """Write the corners of the column of faces that look at one another as candidates; return whether they serve.
 
-    Along the normal of either face, whichever leaves the wider gap, if that is the distance; else the nearest points,
-    where both faces look at one another. A face that lies behind the other one's plane is inside, as deep as it is far.
+    Along the normal of either face, whichever leaves the wider gap, if that is the distance. A face that lies behind
+    the other one's plane is inside, as deep as it is far.
 
     Args:
-        gap: Under which face pairs are near [world units], shape [pair].
+        a: Object in whose frame the pose is.
     """
-    k = wp.tid()
-    if k >= facing.total[0]:
-        return
-    i = facing.place[k]
-    own = rows.faces[i]
-    p = own[0]
-    pose = batch.poses[p]
-    a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
     rotation = trees.objects.rotation[a]
     back = wp.transpose(rotation)
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    load_corners(trees, pose, own[1 + pose.swapped], own[2 - pose.swapped], corner)
+    load_corners(trees, pose, faces[1 + pose.swapped], faces[2 - pose.swapped], corner)
     point = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.vec3d)
     depth = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.float64)
-    normal_a, normal_b = back * contacts.normal_a[i], back * contacts.normal_b[i]
-    first, least, separation = 3 * pose.swapped, -gap[p], contacts.separation[i]
+    normal_a, normal_b = back * contacts.normal_a[w], back * contacts.normal_b[w]
+    first, separation = 3 * pose.swapped, contacts.separation[w]
     slack = wp.max(ALIKE * separation, COLUMN_ROUNDING * faces_size(corner))
-    best = measure_column(corner, -normal_b, normal_a, normal_b, first, least, point, depth)
+    best = measure_column(corner, -normal_b, normal_a, normal_b, first, -gap, point, depth)
     # A gap wider than the distance stays so whatever the other normal says.
     if best.depth == NO_DEPTH or -best.depth - separation <= slack:
-        other = measure_column(corner, normal_a, normal_a, normal_b, first, least, point, depth)
+        other = measure_column(corner, normal_a, normal_a, normal_b, first, -gap, point, depth)
         if best.depth > NO_DEPTH and (other.depth == NO_DEPTH or best.depth < other.depth):
-            best = measure_column(corner, -normal_b, normal_a, normal_b, first, least, point, depth)
+            best = measure_column(corner, -normal_b, normal_a, normal_b, first, -gap, point, depth)
         else:
             best = other
-    if wp.abs(wp.abs(best.depth) - separation) <= slack:
-        curves_inout.loop[i] = wp.where(best.depth > slack, NEAREST_ONLY, i)
-        write_candidates(i, rotation, trees.objects.position[a], best, least, point, depth, curves_inout)
-    else:
-        write_nearest_points(i, trees.objects, a, pose, contacts, curves_inout)
+    serves = wp.abs(wp.abs(best.depth) - separation) <= slack
+    if serves:
+        witnesses.unsure[w] = wp.where(best.depth > slack, 1, 0)
+        write_candidates(w, rotation, trees.objects.position[a], best, -gap, point, depth, witnesses)
+    return serves
+
+
+@wp.kernel(cuda_max_registers=128)
+def find_near_witness_kernel(
+    trees: Trees,
+    batch: PairBatch,
+    gap: wp.array(dtype=wp.float64),
+    hits: Hits,
+    rows: WitnessRows,
+    contacts_out: Contacts,
+    witnesses_out: Witnesses,
+):
+    """Find the contact of one witness of faces that are apart a thread, its normal and its candidate points.
+
+    Where both faces look at one another and the distance may be along the normal of either, corners of columns; else
+    the nearest points, where neither face looks away from the other. A gap along a normal is that of two points of
+    faces, which are convex: points farther apart than the nearest by a fraction e at most are so in a direction whose
+    cosine with that of the distance is at least 1 / (1 + e).
+
+    Args:
+        gap: Under which face pairs are near [world units], shape [pair]; those that are not have no candidates.
+    """
+    w = wp.tid()
+    if w >= wp.min(hits.witness_total[0], rows.item.shape[0]):
+        return
+    item = rows.item[w]
+    witnesses_out.unsure[w] = 0
+    if item[0] < NEAR_BIT:
+        return
+    p = item[0] & PAIR_MASK
+    pose = batch.poses[p]
+    own = contact_objects(batch, p)
+    write_near_contact(w, trees, own, pose, item, contacts_out)
+    n, normal_a, normal_b = contacts_out.normal[w], contacts_out.normal_a[w], contacts_out.normal_b[w]
+    along = wp.max(wp.abs(wp.dot(n, normal_a)), wp.abs(wp.dot(n, normal_b)))
+    served = bool(False)
+    if contacts_out.separation[w] >= gap[p]:
+        for k in range(COLUMN_CORNERS):
+            witnesses_out.depth[w, k] = NO_POINT
+        served = bool(True)
+    elif -wp.dot(normal_a, normal_b) >= OPPOSED_LEAST and along >= ALONG:
+        served = write_facing(w, gap[p], trees, own.a, pose, item, contacts_out, witnesses_out)
+    if not served:
+        write_nearest_points(w, trees.objects, own.a, pose, contacts_out, witnesses_out)

@@ -15,7 +15,8 @@ from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.nodes import load_entry
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.contacts.candidates import ObjectPose, group_lane, group_size, list_candidates
-from warp_abtree.kernels.contacts.manifold import COLUMN_CORNERS, NO_DEPTH, Curves, Manifolds
+from warp_abtree.kernels.contacts.manifold import COLUMN_CORNERS, NO_DEPTH, Manifolds, Witnesses
+from warp_abtree.kernels.contacts.slots import WitnessRows
 
 TWIST_COUNT = native.constant("TWIST_COUNT")
 MODULE_OPTIONS = native.options("contacts/twists.cuh") | {"block_dim": TWIST_COUNT}
@@ -59,15 +60,15 @@ def order_direction(rotation: wp.mat33d):
 
 
 @wp.func
-def number_of(wrench: wp.int32, curves: Curves):
+def number_of(wrench: wp.int32, witnesses: Witnesses):
     """Return the number of the candidate of a wrench."""
-    entry = load_entry(curves.wrench, wp.int64(2) * wp.int64(wrench) + wp.int64(1))
+    entry = load_entry(witnesses.wrench, wp.int64(2) * wp.int64(wrench) + wp.int64(1))
     return wp.cast(entry[3], wp.int32)
 
 
 @wp.func
-def point_of(number: wp.int32, curves: Curves):
-    return curves.point[number / COLUMN_CORNERS, number % COLUMN_CORNERS]
+def point_of(number: wp.int32, witnesses: Witnesses):
+    return witnesses.point[number / COLUMN_CORNERS, number % COLUMN_CORNERS]
 
 
 @wp.func
@@ -76,7 +77,7 @@ def write_in_order(
     along: wp.vec3d,
     count: wp.int32,
     chosen: wp.array(dtype=wp.int32),
-    curves: Curves,
+    witnesses: Witnesses,
     manifolds: Manifolds,
 ):
     """Write the points of a pair in the order in which they lie along a direction of its lower object.
@@ -85,16 +86,16 @@ def write_in_order(
     """
     k = group_lane()
     while k < count:
-        number = number_of(chosen[k], curves)
-        point = point_of(number, curves)
+        number = number_of(chosen[k], witnesses)
+        point = point_of(number, witnesses)
         place = wp.int32(0)
         for j in range(count):
-            ahead = wp.dot(along, point - point_of(number_of(chosen[j], curves), curves))
+            ahead = wp.dot(along, point - point_of(number_of(chosen[j], witnesses), witnesses))
             if ahead > wp.float64(0.0) or (ahead == wp.float64(0.0) and j < k):
                 place += 1
-        depth = curves.depth[number / COLUMN_CORNERS, number % COLUMN_CORNERS]
+        depth = witnesses.depth[number / COLUMN_CORNERS, number % COLUMN_CORNERS]
         manifolds.point[p, place] = point
-        manifolds.normal[p, place] = curves.normal[number / COLUMN_CORNERS]
+        manifolds.normal[p, place] = witnesses.normal[number / COLUMN_CORNERS]
         manifolds.depth[p, place] = wp.where(depth == NO_DEPTH, wp.float64(0.0), depth)
         k += group_size()
     if group_lane() == 0:
@@ -111,8 +112,8 @@ def point_chooser(most: int):
         batch: PairBatch,
         twists: wp.array(dtype=wp.float32),
         gap: wp.array(dtype=wp.float64),
-        start: wp.array(dtype=wp.int32),
-        curves_inout: Curves,
+        rows: WitnessRows,
+        witnesses_inout: Witnesses,
         manifolds_out: Manifolds,
     ):
         """Choose the points of one pair.
@@ -122,7 +123,7 @@ def point_chooser(most: int):
             gap: Of each pair [world units], or [0] for none.
         """
         p = wp.tid() / group_size()
-        contacts = wp.vec2i(start[p], start[p + 1])
+        contacts = wp.vec2i(rows.start[p], rows.start[p] + rows.count[p])
         if contacts[0] >= contacts[1]:
             if group_lane() == 0:
                 manifolds_out.count[p] = 0
@@ -135,7 +136,7 @@ def point_chooser(most: int):
         pose.rotation = objects.rotation[a]
         pose.position = objects.position[a]
         pose.sense = wp.where(batch.pairs[p][0] == a, wp.float64(1.0), wp.float64(-1.0))
-        found = list_candidates(contacts, shell, pose, curves_inout)
+        found = list_candidates(contacts, shell, pose, witnesses_inout)
         chosen = wp.zeros(shape=(wp.static(most),), dtype=wp.int32)
         count = wp.int32(0)
         if found.first < found.end:
@@ -144,7 +145,7 @@ def point_chooser(most: int):
             limit = wp.float64(2.0) * (shell + deepest) + LEAST_MOTION * found.size
             deep = (shell - DEEPER * (shell + inside)) + deepest
             count = choose_by_twists(
-                curves_inout.wrench,
+                witnesses_inout.wrench,
                 found.first,
                 found.end,
                 twists,
@@ -154,6 +155,6 @@ def point_chooser(most: int):
                 wp.static(most),
                 chosen,
             )
-        write_in_order(p, order_direction(pose.rotation), count, chosen, curves_inout, manifolds_out)
+        write_in_order(p, order_direction(pose.rotation), count, chosen, witnesses_inout, manifolds_out)
 
     return choose_point_kernel

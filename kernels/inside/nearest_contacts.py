@@ -5,11 +5,12 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import PairBatch
-from warp_abtree.kernels.contacts.contact import Contacts, have_crossed
-from warp_abtree.kernels.contacts.manifold import COLUMN_CORNERS, NO_POINT, Curves, Rows
-from warp_abtree.kernels.contacts.near_points import NEAREST_ONLY
+from warp_abtree.kernels.contacts.contact import Contacts
+from warp_abtree.kernels.contacts.manifold import COLUMN_CORNERS, NO_POINT, Witnesses
+from warp_abtree.kernels.contacts.slots import WitnessRows
 from warp_abtree.kernels.distance.frame import make_scale
 from warp_abtree.kernels.inside.nearest_face import make_solid, nearest_face
+from warp_abtree.kernels.intersect.face_pairs import PAIR_MASK, Hits
 
 wp.set_module_options(native.options())
 
@@ -18,31 +19,33 @@ NEARER = wp.constant(wp.float64(0.999))
 
 
 @wp.kernel
-def keep_nearest_kernel(trees: Trees, batch: PairBatch, rows: Rows, contacts: Contacts, curves_inout: Curves):
-    """Drop the candidates of a contact a thread if a face of either object is nearer to its points than its faces are.
+def keep_nearest_kernel(
+    trees: Trees, batch: PairBatch, hits: Hits, rows: WitnessRows, contacts: Contacts, witnesses_inout: Witnesses
+):
+    """Drop the candidates of a witness a thread if a face of either object is nearer to its points than its faces are.
 
     By branch and bound over the tree of either object, about the nearest point of the other.
     """
-    i = wp.tid()
-    if i >= rows.start[rows.start.shape[0] - 1]:
+    w = wp.tid()
+    if w >= wp.min(hits.witness_total[0], rows.item.shape[0]):
         return
-    if have_crossed(contacts, i) or curves_inout.loop[i] != NEAREST_ONLY:
+    if witnesses_inout.unsure[w] == 0:
         return
-    p = rows.faces[i][0]
+    p = rows.item[w][0] & PAIR_MASK
     pose = batch.poses[p]
     a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
     scaling = make_scale(trees, pose, a, b)
     back, position = wp.transpose(trees.objects.rotation[a]), trees.objects.position[a]
-    near = NEARER * contacts.separation[i]
+    near = NEARER * contacts.separation[w]
     k = wp.int32(0)
     while k < 2:
         of_b = k != pose.swapped
         own = trees.objects.state[wp.where(of_b, b, a)]
-        point = back * (wp.where(k == 0, contacts.p1[i], contacts.p0[i]) - position)
+        point = back * (wp.where(k == 0, contacts.p1[w], contacts.p0[w]) - position)
         solid = make_solid(trees, pose, scaling, of_b, own)
-        nearest, _ = nearest_face(trees, pose, solid, point, rows.faces[i][1 + k], near)
+        nearest, _ = nearest_face(trees, pose, solid, point, rows.item[w][1 + k], near)
         if nearest < near:
             for j in range(COLUMN_CORNERS):
-                curves_inout.depth[i, j] = NO_POINT
+                witnesses_inout.depth[w, j] = NO_POINT
             k = wp.int32(2)
         k += 1

@@ -29,6 +29,8 @@ OUTPUT_FACES = wp.constant(2)
 WITHIN = wp.constant(-1)
 # EXACT, and face pairs that are apart by less than a gap are listed too.
 GAP = wp.constant(-2)
+# GAP, but all face pairs that are apart and may be nearer than a gap are listed as such, whether they are or not.
+LISTED = wp.constant(-3)
 
 # On the pair of a face pair in `Hits.face`: it is apart.
 NEAR_BIT = wp.constant(1 << 30)
@@ -74,6 +76,7 @@ class Hits:
     gap: wp.array(dtype=wp.float64)  # under which face pairs are near [world units], shape [pair]; [0] for no gap
     apart: wp.array(dtype=wp.vec3i)  # as `uncertain`: pairs that are apart and may be near, shape [capacity]
     apart_total: wp.array(dtype=wp.int32)  # numbers `apart`
+    witness_total: wp.array(dtype=wp.int32)  # rows that face pairs are reduced to, shape [1]; [0] where they are not
 
 
 @wp.func
@@ -200,6 +203,15 @@ def report_hit(slot: wp.int32, pair: wp.int32, swapped: wp.int32, face_a: wp.int
             hits.face[slot] = wp.vec3i(pair, face_b, face_a)
         else:
             hits.face[slot] = wp.vec3i(pair, face_a, face_b)
+
+
+@wp.func
+def count_witnesses(hits: Hits):
+    """Return how many rows face pairs are reduced to, as `count_apart`."""
+    count = wp.int64(0)
+    if hits.witness_total.shape[0] > 0:
+        count = wp.int64(wp.uint32(hits.witness_total[0]))
+    return count
 
 
 @wp.func

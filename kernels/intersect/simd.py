@@ -25,6 +25,7 @@ from warp_abtree.kernels.intersect.descent import (
 )
 from warp_abtree.kernels.intersect.face_pairs import (
     GAP,
+    LISTED,
     OUTPUT_ANY,
     OUTPUT_FACES,
     WITHIN,
@@ -35,7 +36,7 @@ from warp_abtree.kernels.intersect.face_pairs import (
     scaled_gap,
     test_faces,
 )
-from warp_abtree.kernels.intersect.near_faces import part_uncertain, report_near
+from warp_abtree.kernels.intersect.near_faces import list_all_apart, part_uncertain, report_near
 from warp_abtree.kernels.intersect.relative_pose import ThreadSteps, pairs_starter
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
 from warp_abtree.kernels.search.load_balance import Work, take_thread, take_unit
@@ -237,8 +238,9 @@ def test_gap_pairs(
 
 @functools.cache
 def thread_traversal(mode: int):
-    """Return the kernel whose threads share the object pairs, at a precision, WITHIN or GAP."""
-    start_pairs = pairs_starter(mode in (int(WITHIN), int(GAP)))
+    """Return the kernel whose threads share the object pairs, at a precision, WITHIN, GAP or LISTED."""
+    with_gap = mode in (int(GAP), int(LISTED))
+    start_pairs = pairs_starter(with_gap or mode == int(WITHIN))
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def traverse_thread_kernel(
@@ -261,7 +263,7 @@ def thread_traversal(mode: int):
         below = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
         faces = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
         uncertain = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
-        apart = wp.zeros(shape=wp.static(WAITING_LENGTH if mode == int(GAP) else 1), dtype=wp.int64)
+        apart = wp.zeros(shape=wp.static(WAITING_LENGTH if with_gap else 1), dtype=wp.int64)
         descent = Descent()
         descent.thread = take_thread(work_inout.counter)
         p = take_unit(work_inout.counter)
@@ -275,9 +277,12 @@ def thread_traversal(mode: int):
             while descent.top > 0 or descent.deep > 0:
                 waiting = advance(trees, pose, hit_count, descent, stack, below, memory_inout, faces)
                 found = Filtered()
-                if wp.static(mode == int(GAP)):
+                if wp.static(with_gap):
                     test_gap_pairs(trees, pose, waiting, faces, uncertain, apart, found, tests)
-                    near_count += wp.int64(report_near(trees, pose, p, found.apart, apart, hits_inout))
+                    if wp.static(mode == int(GAP)):
+                        near_count += wp.int64(report_near(trees, pose, p, found.apart, apart, hits_inout))
+                    else:
+                        list_all_apart(p, found.apart, apart, hits_inout)
                 else:
                     test_leaf_pairs(wp.static(mode), output, trees, pose, waiting, faces, uncertain, found, tests)
                 if found.met > 0:

@@ -2,22 +2,22 @@
 
 The block of n pairs, in words of 8 bytes:
 
-    [ header 5 | count n | node tests n | triangle tests n | float64 tests n | exact tests n | pairs n | flags ]
+    [ header 6 | count n | node tests n | triangle tests n | float64 tests n | exact tests n | pairs n | flags ]
 
-The header holds what became of the launch, object pairs found, face pairs found, uncertain face pairs, and those that
-are listed as apart for a gap. Pairs stand there only where they are asked. The flags are bytes: n whether a pair
-intersects, n whether it is apart.
+The header holds what became of the launch, object pairs found, face pairs found, uncertain face pairs, those that are
+listed as apart for a gap, and rows that face pairs are reduced to. Pairs stand there only where they are asked. The
+flags are bytes: n whether a pair intersects, n whether it is apart.
 """
 
 import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.poses import PairBatch
-from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart
+from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart, count_witnesses
 
 wp.set_module_options(native.options())
 
-HEADER_WORDS = wp.constant(5)
+HEADER_WORDS = wp.constant(6)
 COUNT_COLUMNS = wp.constant(5)
 BLOCK_DIM = 256
 
@@ -55,6 +55,7 @@ def pack_pair_kernel(
         words_inout[0] = wp.int64(batch.launched[0])
         words_inout[1] = wp.int64(batch.count[0])
         words_inout[4] = count_apart(hits)
+        words_inout[5] = count_witnesses(hits)
     if i < n:
         words_inout[HEADER_WORDS + i] = hit_count
         words_inout[HEADER_WORDS + n + i] = hits.node_tests[i]

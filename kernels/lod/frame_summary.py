@@ -5,17 +5,17 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.counters import add_lanes
 from warp_abtree.kernels.base.poses import PairBatch
-from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart
+from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart, count_witnesses
 
 wp.set_module_options(native.options("base/counters.cuh"))
 
 FRAMES, LAUNCHED, PAIRS, HITS, UNCERTAIN_PAIRS, APART, INTERSECTING, NODE_TESTS, TRIANGLE_TESTS = range(9)
-REFITTED, CHANGED, TURNED = 9, 10, 11
+REFITTED, CHANGED, TURNED, WITNESSES = 9, 10, 11, 12
 """Words of a summary: frames so far, what became of the query's launch (`LaunchRecord`), object pairs, face pairs that
 intersect, that are uncertain, and that may be within a gap, pairs that intersect, pairs of boxes and of faces tested,
-nodes refitted, objects whose level changed, and those that turned back."""
+nodes refitted, objects whose level changed, those that turned back, and rows that face pairs are reduced to."""
 
-HEAD = wp.constant(12)
+HEAD = wp.constant(13)
 """Words before those that count the objects at each level."""
 
 TRIANGLE_WORK = wp.constant(wp.int64(4))
@@ -75,5 +75,6 @@ def summarise_frame_kernel(
         summary_out[wp.static(LAUNCHED)] = wp.int64(batch.launched[0])
         summary_out[wp.static(PAIRS)] = wp.int64(batch.count[0])
         summary_out[wp.static(APART)] = count_apart(hits)
+        summary_out[wp.static(WITNESSES)] = count_witnesses(hits)
         summary_out[wp.static(CHANGED)] = wp.int64(changed[0])
         summary_out[wp.static(TURNED)] = wp.int64(changed[1])

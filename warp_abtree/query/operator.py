@@ -55,6 +55,7 @@ class Operator(DeviceMemory):
         pair_batch: `PairBatch` of the pairs queried.
         hits: Device arrays of the last launch, `kernels.intersect.face_pairs.Hits`.
         counts: Counters of `hits`, device int64; rows: count, then `COUNTERS`.
+        lists_apart: Whether face pairs that are apart and may be near are listed, on every device.
         traversal: `Traversal` of the hits, which stages share.
         lists_hits: Whether a result has the hits as rows, which are sorted while the host still launches.
         given: Pairs on the host, int32 (p, 2), unless the broad phase finds them.
@@ -66,6 +67,7 @@ class Operator(DeviceMemory):
     broad_phase: Any = None
     near: Any = None
     hits: Any
+    lists_apart = False
     counts: wp.array
     traversal: Any
     lists_hits = False
@@ -91,7 +93,7 @@ class Operator(DeviceMemory):
         self._attach_stages()
         places = self._find_places(room.pairs, sort_pairs)
         self.readout = Readout(self)
-        uncertain = (room.uncertain or UNCERTAIN_ROOM) if self.uses_warps() else 0
+        uncertain = (room.uncertain or UNCERTAIN_ROOM) if self.uses_warps() or self.lists_apart else 0
         hits = (room.hits or max(1024, 16 * places)) if output == "faces" else 0
         self.rooms = Rooms()
         self.make_room(places, hits, uncertain)

@@ -118,9 +118,15 @@ class Readout:
         if operator.output == "faces":
             total = int(views.counts[0].sum())
         if operator.rooms.uncertain:
-            apart = int(hits.apart_total.numpy().view(np.uint32)[0]) if hits.apart_total is not None else 0
-            uncertain = max(apart, int(views.counts[FLOAT64_ROW].sum()))
+            apart, witnesses = (self._read_count(count) for count in (hits.apart_total, hits.witness_total))
+            waiting = int(views.counts[FLOAT64_ROW].sum()) if operator.uses_warps() else 0
+            total, uncertain = max(total, witnesses), max(apart, waiting)
         return Totals(operator.guard.outcome(), self._pair_count(int(views.pair_count[0])), total, uncertain)
+
+    @staticmethod
+    def _read_count(count) -> int:
+        """Return a counter of the CPU, read as uint32; 0 where there is none."""
+        return 0 if count is None else int(count.numpy().view(np.uint32)[0])
 
     def _pair_count(self, found: int) -> int:
         """Return how many pairs there are, of which so many were read on the device."""
@@ -129,7 +135,8 @@ class Readout:
 
     def _totals(self, words) -> Totals:
         """Return the demands in a header; those of lists that the operator lacks are 0."""
-        launched, found, total, uncertain, apart = words[:HEADER].tolist()
+        launched, found, total, uncertain, apart, witnesses = words[:HEADER].tolist()
+        total = max(total, witnesses)
         listed, waits = self.operator.output == "faces", self.operator.rooms.uncertain
         return Totals(launched, self._pair_count(found), total if listed else 0, max(uncertain, apart) if waits else 0)
 

@@ -26,7 +26,7 @@ from warp_abtree.state.poses import check_poses, launch_place
 # Words of `kernels.lod.frame_summary` by name, in their order.
 WORDS = (
     "frames launched pairs hits uncertain apart intersecting node_tests triangle_tests "
-    "nodes_refitted lods_changed oscillations"
+    "nodes_refitted lods_changed oscillations witnesses"
 ).split()
 
 
@@ -209,6 +209,6 @@ class FrameStages:
         return (
             found["launched"] >= 0
             and 0 <= found["pairs"] <= len(query.pairs)
-            and (query.output != "faces" or found["hits"] <= len(query.hits.face))
+            and (query.output != "faces" or max(found["hits"], found["witnesses"]) <= len(query.hits.face))
             and (not room or max(found["uncertain"], found["apart"]) <= room)
         )

@@ -147,6 +147,12 @@ constexpr int CHUNK = 32;
 // Twists by which contact points are chosen: one a thread of a block.
 constexpr int TWIST_COUNT = 256;
 
+// Slots of near faces of an object pair: bins of normals, of each the nearest and the farthest in six directions.
+constexpr int NORMAL_BINS = 20;
+constexpr int SLOTS_A_BIN = 7;
+constexpr int SLOT_ROOM = 140;
+static_assert(SLOT_ROOM == NORMAL_BINS * SLOTS_A_BIN, "no gap");
+
 // Certified errors: faces about a merge, distances of corners to them, corners of a polygon, polygons on the stack,
 // faces that cover a triangle, cuts of one, and triangles covered at once.
 constexpr int NEAR_ROOM = 64;

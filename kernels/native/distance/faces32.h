@@ -29,10 +29,11 @@ struct NearestFaces {
         return most(most(F::absolute(p.x), F::absolute(p.y)), F::absolute(p.z));
     }
 
+    // From edge e to f, r from its start to that of f, and the parameter on e.
     static CUDA_CALLABLE Point between_edges(const Point& r, const Point& e, const Point& f, const lanes& inverse_e,
-                                             const lanes& inverse_f) {
+                                             const lanes& inverse_f, lanes& s) {
         const Point n = F::cross(e, f);
-        lanes s = clamp(F::dot(F::cross(r, f), n) * invert(F::dot(n, n)));
+        s = clamp(F::dot(F::cross(r, f), n) * invert(F::dot(n, n)));
         const lanes t = clamp((F::dot(e, f) * s - F::dot(r, f)) * inverse_f);
         s = clamp(F::dot(add(r, t, f), e) * inverse_e);
         return add(add(r, t, f), -s, e);
@@ -47,33 +48,45 @@ struct NearestFaces {
         const lanes far = lanes{} + 0x1p60f;
         return Point{inside ? v.x : far, inside ? v.y : far, inside ? v.z : far};
     }
-    static CUDA_CALLABLE void offer(lanes& nearest, const Point& v) { nearest = least(nearest, F::dot(v, v)); }
-    // Squared distances, and the largest coordinate of what joins corners.
-    static CUDA_CALLABLE lanes measure(const Corners& c, lanes& size) {
+    // Offers what joins all edges, and corners and faces, to a keeper; returns the largest coordinate of what joins
+    // corners.
+    template <class Keeper>
+    static CUDA_CALLABLE lanes visit(const Corners& c, Keeper& keeper) {
         const Point e[3] = {F::minus(c.a[1], c.a[0]), F::minus(c.a[2], c.a[1]), F::minus(c.a[0], c.a[2])};
         const Point f[3] = {F::minus(c.b[1], c.b[0]), F::minus(c.b[2], c.b[1]), F::minus(c.b[0], c.b[2])};
-        lanes inverse_e[3], inverse_f[3];
-        lanes nearest = lanes{} + 0x1.fffffep127f;
+        lanes inverse_e[3], inverse_f[3], size = {}, s;
         for (int k = 0; k < 3; ++k) {
             inverse_e[k] = invert(F::dot(e[k], e[k]));
             inverse_f[k] = invert(F::dot(f[k], f[k]));
         }
-        size = lanes{};
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j) {
                 const Point r = F::minus(c.b[j], c.a[i]);
                 size = most(size, largest(r));
-                offer(nearest, between_edges(r, e[i], f[j], inverse_e[i], inverse_f[j]));
+                const Point v = between_edges(r, e[i], f[j], inverse_e[i], inverse_f[j], s);
+                keeper.offer_edges(v, c.a[i], s, e[i]);
             }
         const Point back_a = F::minus(c.a[2], c.a[0]), back_b = F::minus(c.b[2], c.b[0]);
         const Point n = cross_exactly(e[0], back_a), m = cross_exactly(f[0], back_b);
         const lanes inverse_n = invert(F::dot(n, n)), inverse_m = invert(F::dot(m, m));
         for (int k = 0; k < 3; ++k) {
-            offer(nearest, over_face(F::minus(c.b[k], c.a[0]), e[0], back_a, n, inverse_n));
-            offer(nearest, over_face(F::minus(c.a[k], c.b[0]), f[0], back_b, m, inverse_m));
+            keeper.offer_corner_of_b(over_face(F::minus(c.b[k], c.a[0]), e[0], back_a, n, inverse_n), c.b[k]);
+            keeper.offer_corner_of_a(over_face(F::minus(c.a[k], c.b[0]), f[0], back_b, m, inverse_m), c.a[k]);
         }
-        size = most(most(size, largest(e[0])), most(largest(back_a), most(largest(f[0]), largest(back_b))));
-        return nearest;
+        return most(most(size, largest(e[0])), most(largest(back_a), most(largest(f[0]), largest(back_b))));
+    }
+    struct Nearest {
+        lanes square;
+        CUDA_CALLABLE void offer(const Point& v) { square = least(square, F::dot(v, v)); }
+        CUDA_CALLABLE void offer_edges(const Point& v, const Point&, const lanes&, const Point&) { offer(v); }
+        CUDA_CALLABLE void offer_corner_of_b(const Point& v, const Point&) { offer(v); }
+        CUDA_CALLABLE void offer_corner_of_a(const Point& v, const Point&) { offer(v); }
+    };
+    // Squared distances, and the largest coordinate of what joins corners.
+    static CUDA_CALLABLE lanes measure(const Corners& c, lanes& size) {
+        Nearest nearest = {lanes{} + 0x1.fffffep127f};
+        size = visit(c, nearest);
+        return nearest.square;
     }
     // What distances err by: over 48 u L where they are small. `own` is what coordinates make of it.
     static CUDA_CALLABLE lanes error_of(const lanes& d, const lanes& size, float own) {

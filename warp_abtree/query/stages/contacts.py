@@ -78,6 +78,7 @@ from warp_abtree.query.sorting import HitSort, first_sort
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
 from warp_abtree.query.stages.inside import InsideStage
 from warp_abtree.query.stages.intersect import ApartStage, GapStage, IntersectStage
+from warp_abtree.query.stages.slots import SlotStage
 from warp_abtree.query.staging import first_rows
 from warp_abtree.state.batch import Batch
 
@@ -298,15 +299,20 @@ class ContactStage(Stage):
 
 
 def plan_contacts(precision, within, gap, sums: bool, dtype: Any = np.float64) -> list[Stage]:
-    """Return the stages that find contacts, and their summaries or not; raise ValueError for an unknown precision."""
+    """Return the stages that find contacts and their summaries, or those that are reduced to points.
+
+    Raises:
+        ValueError: An unknown precision.
+    """
     check_request("faces", precision)
-    intersect = IntersectStage("faces", precision, gap is not None, reads=False)
+    intersect = IntersectStage("faces", precision, gap is not None, reads=False, reduced=not sums)
     apart: list[Stage] = [] if within is None else [ApartStage(within)]
     if gap is not None:
         gaps = gap if isinstance(gap, GapStage) else GapStage(gap)
         gaps.give_to(intersect.hits, precision)
         apart.append(gaps)
-    return [*apart, intersect, InsideStage(), ContactStage(precision, gap is not None, sums, dtype)]
+    slots: list[Stage] = [] if sums else [SlotStage(gap is not None)]
+    return [*apart, intersect, *slots, InsideStage(), ContactStage(precision, gap is not None and sums, sums, dtype)]
 
 
 def warn_of_winding(scene):

@@ -50,6 +50,7 @@ class IntersectStage(HitStage):
         output: "any", "count" or "faces".
         precision: As for `Query`.
         with_gap: Whether the hits have gaps.
+        reduced: Whether what is apart is only listed, for another stage to reduce.
         reads: Whether results have the hits as rows.
 
     Attributes:
@@ -58,10 +59,13 @@ class IntersectStage(HitStage):
 
     traversal: Traversal
 
-    def __init__(self, output="any", precision="exact", with_gap=False, reads=True):
+    def __init__(self, output="any", precision="exact", with_gap=False, reads=True, reduced=False):
         super().__init__()
+        self._reduced = reduced
         self._is_exact, self._with_gap, self._reads = precision == "exact", with_gap, reads and output == "faces"
         self._mode = int(face_pairs.GAP if with_gap else PRECISIONS[precision])
+        if reduced and with_gap:
+            self._mode = int(face_pairs.LISTED)
         self._output = int(OUTPUTS[output])
 
     def attach(self, operator: Operator):
@@ -72,6 +76,7 @@ class IntersectStage(HitStage):
         self.traversal = Traversal(operator, self._output == int(face_pairs.OUTPUT_ANY))
         self._no_distance = wp.empty(0, dtype=wp.float64, device=operator.device)
         operator.hits, operator.traversal, operator.lists_hits = self.hits, self.traversal, self._reads
+        operator.lists_apart = self._reduced and self._with_gap
 
     def kernels(self, device) -> list:
         """Return the kernels of the traversal."""
@@ -80,7 +85,8 @@ class IntersectStage(HitStage):
 
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return the arrays of hits, and the lists of face pairs that wait."""
-        lists = {"face": rooms.hits, "uncertain": rooms.uncertain, "inexact": rooms.uncertain if self._is_exact else 0}
+        waiting = rooms.uncertain if self.operator.uses_warps() else 0
+        lists = {"face": rooms.hits, "uncertain": waiting, "inexact": waiting if self._is_exact else 0}
         if self._with_gap:
             lists["apart"] = rooms.uncertain
         made = [Array(self.hits, name, wp.vec3i, room) for name, room in lists.items()]

@@ -50,13 +50,14 @@ import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.kernels.base.lanes import WARP_SIZE
-from warp_abtree.kernels.contacts import loops, manifold, near_points
+from warp_abtree.kernels.contacts import contact, loops, manifold, near_points
 from warp_abtree.kernels.contacts import points as point_kernels
 from warp_abtree.kernels.inside import inside_points, nearest_contacts
 from warp_abtree.query.operator import Operator
-from warp_abtree.query.result import Found, Result
+from warp_abtree.query.result import VECTORS, Found, Result
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
 from warp_abtree.query.stages.contacts import ContactStage, plan_contacts, warn_of_winding
+from warp_abtree.query.stages.slots import SlotStage
 from warp_abtree.query.staging import first_rows
 
 POINTS_MAX = int(manifold.POINTS)
@@ -75,17 +76,21 @@ class PointStage(Stage):
     """Reduce the contacts of each pair to points.
 
     Args:
-        contacts: `ContactStage`, the stage before, whose scratch serves on.
+        slots: `SlotStage`, the stage that has reduced what is near.
+        contacts: `ContactStage`, the stage before, of what crosses, whose scratch serves on.
         with_gap: Whether faces that are apart have contacts, too.
         point_max: As `ManifoldQuery.point_max`.
 
     Attributes:
-        manifolds, curves: Device arrays of `kernels.contacts.manifold`: points of pairs, loops of contacts.
+        manifolds, curves, witnesses: Device arrays of `kernels.contacts.manifold`: points of pairs, loops of contacts,
+            and candidates.
+        near: Contacts of those witnesses that are apart, `kernels.contacts.contact.Contacts`.
     """
 
-    def __init__(self, contacts: ContactStage, with_gap: bool, point_max: int):
-        self._contacts, self._with_gap, self.point_max = contacts, with_gap, point_max
+    def __init__(self, slots: SlotStage, contacts: ContactStage, with_gap: bool, point_max: int):
+        self._slots, self._contacts, self._with_gap, self.point_max = slots, contacts, with_gap, point_max
         self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
+        self.witnesses, self.near = manifold.Witnesses(), contact.Contacts()
 
     def attach(self, operator: Operator):
         """Take the operator."""
@@ -94,57 +99,58 @@ class PointStage(Stage):
         self._no_gap = wp.empty(0, dtype=wp.float64, device=operator.device)
 
     def arrays(self, rooms: Rooms) -> list[Array]:
-        """Return what has an entry a contact or a pair."""
-        curves, hits = self.curves, rooms.hits
+        """Return what has an entry a contact, a witness or a pair."""
+        witnesses, room = self.witnesses, self._slots.room(rooms)
+        near = fields(self.near, room, **dict.fromkeys(VECTORS, wp.vec3d), coplanar=wp.int32, separation=wp.float64)
         return [
-            *fields(curves, hits, parent=wp.int32, loop=wp.int32, loop_normal=wp.vec3d, normal=wp.vec3d),
-            *fields(curves, (hits, CANDIDATES), point=wp.vec3d, depth=wp.float64),
-            Array(curves, "wrench", wp.vec4, 2 * CANDIDATES * hits),
+            *fields(self.curves, rooms.hits, parent=wp.int32, loop=wp.int32, loop_normal=wp.vec3d),
+            *fields(witnesses, (room, CANDIDATES), point=wp.vec3d, depth=wp.float64),
+            *fields(witnesses, room, normal=wp.vec3d, unsure=wp.int32),
+            Array(witnesses, "wrench", wp.vec4, 2 * CANDIDATES * room),
+            *(near if self._with_gap else []),
             Array(self.manifolds, "count", wp.int32, rooms.pairs, 0),
             *fields(self.manifolds, (rooms.pairs, self.point_max), **POINT_FIELDS),
         ]
 
     def report(self, count: int | None):
         """Reduce the contacts of the hits in place. Launches only."""
-        of, operator, curves, launch = self._contacts, self.operator, self.curves, self.operator.launch_kernel
-        count, room = of.places(count), operator.rooms.pairs
+        operator, launch, contacts = self.operator, self.operator.launch_kernel, self._contacts.contacts
         gap = operator.hits.gap if self._with_gap else self._no_gap
-        posed = [operator.batch.trees, operator.pair_batch]
-        start, faces, contacts, sorted_by = of.start, of.faces, of.contacts, (of.order, of.key)
-        rows = manifold.Rows()
-        rows.start, rows.faces, rows.order, rows.key = start, faces, *sorted_by
-        inputs = [start, faces, curves, *sorted_by, of.deferred.total]
-        launch(loops.begin_loop_kernel, count, inputs)
-        self._sort_keys(count, 31 + room.bit_length())
-        launch(loops.link_loop_kernel, count, [start, faces, contacts, *sorted_by, curves])
+        posed = [operator.batch.trees, operator.pair_batch, gap]
+        self._offer_crossing(self._contacts.places(count), posed)
+        self._slots.list_witnesses()
+        room, found = self._slots.room(operator.rooms), [operator.hits, self._slots.rows]
+        some = room if count is None else min(room, count)
+        inputs = [*posed, self._contacts.faces, contacts, self.curves, *found, self.witnesses]
+        launch(manifold.find_crossing_kernel, some, inputs, WARP_SIZE)
         if self._with_gap:
-            self._find_near(count, posed, gap, rows)
-        launch(loops.name_loop_kernel, count, [start, contacts, curves, *sorted_by])
-        self._sort_keys(count, 31)
-        inputs = [*posed, start, faces, contacts, of.order, curves]
-        launch(loops.average_loop_kernel, -(-count // WARP_SIZE) * WARP_SIZE, inputs, WARP_SIZE)
-        launch(manifold.find_candidate_kernel, count, [*posed, gap, rows, contacts, curves])
-        self._choose_points([operator.batch.objects.pool, operator.pair_batch, self._twists, gap, start])
+            launch(near_points.find_near_witness_kernel, some, [*posed, *found, self.near, self.witnesses], WARP_SIZE)
+            inputs = [*posed[:2], *found, self.near, self.witnesses]
+            launch(nearest_contacts.keep_nearest_kernel, some, inputs, WARP_SIZE)
+        self._choose_points([operator.batch.objects.pool, operator.pair_batch, self._twists, gap])
         self._add_inside_points()
 
-    def _choose_points(self, posed):
+    def _offer_crossing(self, count: int, posed):
+        """Find the loops of what crosses, and offer its candidates to the slots. Launches only."""
+        of, operator, curves, launch = self._contacts, self.operator, self.curves, self.operator.launch_kernel
+        start, faces, contacts, sorted_by = of.start, of.faces, of.contacts, (of.order, of.key)
+        launch(loops.begin_loop_kernel, count, [start, faces, curves, *sorted_by])
+        self._sort_keys(count, 31 + operator.rooms.pairs.bit_length())
+        launch(loops.link_loop_kernel, count, [start, faces, contacts, *sorted_by, curves])
+        launch(loops.name_loop_kernel, count, [start, curves, *sorted_by])
+        self._sort_keys(count, 31)
+        inputs = [*posed[:2], start, faces, contacts, of.order, curves]
+        launch(loops.average_loop_kernel, -(-count // WARP_SIZE) * WARP_SIZE, inputs, WARP_SIZE)
+        inputs = [*posed, start, faces, of.order, contacts, curves, operator.hits, self._slots.slots]
+        launch(manifold.offer_crossing_kernel, count, inputs)
+
+    def _choose_points(self, given):
         """Choose the points of each pair. Launches only."""
         operator, room = self.operator, self.operator.rooms.pairs
         block = point_kernels.TWIST_COUNT if operator.device.is_cuda else 1
+        inputs = [*given, self._slots.rows, self.witnesses, self.manifolds]
         chooser = point_kernels.point_chooser(self.point_max)
-        operator.launch_kernel(chooser, room * block, [*posed, self.curves, self.manifolds], point_kernels.TWIST_COUNT)
-
-    def _find_near(self, count, posed, gap, rows):
-        """Find the candidates of faces that are apart. Launches only."""
-        operator, curves = self.operator, self.curves
-        contacts, listed = self._contacts.contacts, self._contacts.deferred
-        threads = -(-count // WARP_SIZE)
-        inputs = [operator.batch.objects.pool, operator.pair_batch, rows, contacts, listed, curves]
-        operator.launch_kernel(near_points.find_near_candidate_kernel, threads * WARP_SIZE, inputs, WARP_SIZE)
-        inputs = [*posed, gap, rows, contacts, listed, curves]
-        operator.launch_kernel(near_points.find_facing_candidate_kernel, count, inputs, WARP_SIZE)
-        inputs = [*posed, rows, contacts, curves]
-        operator.launch_kernel(nearest_contacts.keep_nearest_kernel, count, inputs, WARP_SIZE)
+        operator.launch_kernel(chooser, room * block, inputs, point_kernels.TWIST_COUNT)
 
     def _add_inside_points(self):
         """Add points of what is inside, where there are solids. Launches only."""
@@ -196,8 +202,10 @@ class ManifoldQuery(Operator):
         self.point_max = whole_number(points, "points", 1, 64)
         stages = plan_contacts(precision, None, gap, sums=False)
         contacts: Any = stages[-1]
-        found = PointStage(contacts, gap is not None, self.point_max)
+        slots: Any = next(stage for stage in stages if isinstance(stage, SlotStage))
+        found = PointStage(slots, contacts, gap is not None, self.point_max)
         self.contacts, self.manifolds, self.curves = contacts.contacts, found.manifolds, found.curves
+        self.witnesses = found.witnesses
         warn_of_winding(scene)
         super().__init__(scene, [*stages, found], pairs, capacity, "faces", sort_pairs=True)
 

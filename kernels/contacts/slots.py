@@ -1,0 +1,225 @@
+"""Slots: contact witnesses of an object pair, those face pairs that a choice of contact points needs.
+
+The normal of a contact is in one of 20 bins. Each bin has a slot for the deepest contact and six for those that lie
+farthest in six directions across the normal, with their depth, so that what is at the rim of a contact is kept. A slot
+keeps the witness of the highest score; which one depends on what was offered alone, not on the order, and is the same
+on every device. Bins of normals with extreme points are what contact reductions of physics engines keep, too (Newton,
+PhysX).
+
+Offered are candidate points of contacts that cross (`manifold`), and faces that are apart, nearer than the gap. Of
+these in float32: faces that look at one another within 60 degrees have the mean of their normals, and each corner
+within the column of the other face counts as a point of its own; others have the direction of their distance, unless
+either face looks away from it. Who wins is measured in float64 (`near_points`).
+
+Scores are float32, in A's frame at unit size: the depth, and for directions the reach times the pair's weight, the gap
+over the size of the smaller object. A key of a slot is
+
+    63              32 31           0
+    [ sortable score  |   place    ]    place: of a crossing contact, with bit 31, or in the list of near face pairs
+
+Of equal scores what crosses goes before what is apart, then the lower place of a contact, or the lower faces.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
+from warp_abtree.kernels.base.lanes import next_place, warp_lane, warp_size
+from warp_abtree.kernels.base.nodes import load_node
+from warp_abtree.kernels.base.poses import PairBatch, PairPose
+from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
+from warp_abtree.kernels.search.item import INDEX_MASK
+from warp_abtree.kernels.triangle.distance_bounds import load_points, three_points
+
+HEADERS = "base/counters.cuh", "base/lanes.cuh", "contacts/slots.cuh", "contacts/offer_list.h"
+wp.set_module_options(native.options(*HEADERS))
+
+NORMAL_BINS, SLOTS_A_BIN, SLOT_ROOM = (native.constant(name) for name in ("NORMAL_BINS", "SLOTS_A_BIN", "SLOT_ROOM"))
+ALL_SLOTS = wp.constant(wp.int64(SLOT_ROOM))
+NO_KEY = wp.constant(wp.int64(1 - 2**63))
+# Directions count so much at least, where gaps are tiny.
+WEIGHT_LEAST = wp.constant(wp.float64(2.0**-8))
+
+
+@wp.struct
+class Slots:
+    """Slots of all object pairs."""
+
+    key: wp.array(dtype=wp.int64)  # NO_KEY where there is none, shape [SLOT_ROOM * pair]
+    measures: wp.array(dtype=wp.vec2)  # gap at unit size, and weight of directions, shape [pair]
+    directions: wp.array(dtype=wp.float32)  # normal of each bin and two vectors across it, shape [9 * NORMAL_BINS]
+
+
+@wp.struct
+class WitnessRows:
+    """What slots keep, those of each pair side by side in the order of its slots."""
+
+    start: wp.array(dtype=wp.int32)  # where those of a pair begin, shape [pair]
+    count: wp.array(dtype=wp.int32)  # how many, shape [pair]
+    item: wp.array(dtype=wp.vec3i)  # (pair with NEAR_BIT, face of its first object, of its second) of faces apart,
+    # (pair, crossing contact, 0), or (-1, 0, 0) for a place that is left, shape [witness]
+
+
+@native.func_native()
+def offer_faces(
+    a: three_points,
+    b: three_points,
+    gap: wp.float32,
+    weight: wp.float32,
+    directions: wp.array(dtype=wp.float32),
+    place: wp.int32,
+    pair: wp.int32,
+    list: wp.array(dtype=wp.vec3i),
+    slots: wp.array(dtype=wp.int64),
+):
+    """Offer a listed face pair that is apart, in A's frame at unit size, to the slots of its object pair."""
+
+
+@native.func_native()
+def offer_point(
+    normal: wp.vec3,
+    point: wp.vec3,
+    separation: wp.float32,
+    weight: wp.float32,
+    directions: wp.array(dtype=wp.float32),
+    place: wp.int32,
+    pair: wp.int32,
+    list: wp.array(dtype=wp.vec3i),
+    slots: wp.array(dtype=wp.int64),
+):
+    """Offer a point of a crossing contact, in A's frame at unit size, to the slots of its object pair."""
+
+
+@native.func_native(cpu=True)
+def simd_offer_list(
+    models: ModelPool,
+    states: StatePool,
+    pair_poses: wp.array(dtype=PairPose),
+    count: wp.int32,
+    list: wp.array(dtype=wp.vec3i),
+    measures: wp.array(dtype=wp.vec2),
+    directions: wp.array(dtype=wp.float32),
+    slots: wp.array(dtype=wp.int64),
+):
+    """Offer so many listed face pairs to the slots of their object pairs, 16 at a time."""
+
+
+@wp.func
+def size_of(trees: Trees, state: wp.int32):
+    """Return half of the diagonal of the root box of a tree state."""
+    root = load_node(trees.states, trees.states.node_start[state] + 1)
+    return wp.float64(0.5) * wp.length(wp.vec3d(root.upper) - wp.vec3d(root.lower))
+
+
+@wp.kernel
+def start_slots_kernel(
+    trees: Trees, batch: PairBatch, gap: wp.array(dtype=wp.float64), hits_out: Hits, slots_out: Slots
+):
+    """Empty one slot a thread, and measure the object pair of the first one.
+
+    Args:
+        gap: Of each pair [world units], or [0] for none.
+    """
+    i = wp.tid()
+    p = i / SLOT_ROOM
+    slots_out.key[i] = NO_KEY
+    if i == 0:
+        hits_out.witness_total[0] = 0
+    if i == p * SLOT_ROOM and p < batch.count[0] and p < batch.pairs.shape[0]:
+        shell, one = wp.float64(0.0), wp.float64(1.0)
+        if gap.shape[0] > 0:
+            shell = gap[p]
+        a, b = trees.objects.state[batch.pairs[p][0]], trees.objects.state[batch.pairs[p][1]]
+        size = wp.min(size_of(trees, a), size_of(trees, b))
+        weight = WEIGHT_LEAST
+        if shell > WEIGHT_LEAST * size:
+            weight = wp.min(shell, size) / wp.max(size, wp.min(shell, size))
+        slots_out.measures[p] = wp.vec2(wp.float32(shell * batch.poses[p].scale), wp.float32(wp.min(weight, one)))
+
+
+@wp.kernel
+def offer_near_kernel(step: wp.int32, trees: Trees, batch: PairBatch, hits: Hits, slots_inout: Slots):
+    """Offer the face pairs that are listed as apart to the slots of their object pairs, in a grid-stride loop."""
+    i = wp.uint32(wp.tid())
+    end = wp.min(wp.uint32(hits.apart_total[0]), wp.uint32(hits.apart.shape[0]))
+    while i < end:
+        row = hits.apart[i]
+        pose = batch.poses[row[0]]
+        scale = wp.float32(pose.scale)
+        a, b = load_points(trees, pose, pose.translation32 * scale, scale, row[1], row[2])
+        measures = slots_inout.measures[row[0]]
+        directions = slots_inout.directions
+        offer_faces(a, b, measures[0], measures[1], directions, wp.int32(i), row[0], hits.apart, slots_inout.key)
+        i += wp.uint32(step)
+
+
+@wp.kernel
+def offer_list_kernel(trees: Trees, batch: PairBatch, hits: Hits, slots_inout: Slots):
+    """Do what `offer_near_kernel` does, 16 face pairs at a time, by one thread; CPU only."""
+    count = wp.int32(wp.min(wp.uint32(hits.apart_total[0]), wp.uint32(hits.apart.shape[0])))
+    measures, directions = slots_inout.measures, slots_inout.directions
+    simd_offer_list(trees.models, trees.states, batch.poses, count, hits.apart, measures, directions, slots_inout.key)
+
+
+@wp.func
+def is_first(slots: Slots, at: wp.int32):
+    """Return whether a slot keeps a witness that no slot before it in its bin keeps."""
+    key = slots.key[at]
+    if key == NO_KEY:
+        return False
+    k = at - at % SLOTS_A_BIN
+    while k < at and (slots.key[k] == NO_KEY or wp.int32(slots.key[k]) != wp.int32(key)):
+        k += 1
+    return k == at
+
+
+@wp.kernel
+def reserve_witness_kernel(batch: PairBatch, slots: Slots, hits_inout: Hits, rows_out: WitnessRows):
+    """Reserve places for the witnesses of one object pair, by a warp: of near faces, and all that may yet cross."""
+    p = wp.tid() / warp_size()
+    found, first = wp.int32(0), wp.int32(0)
+    if p >= batch.count[0] or p >= batch.pairs.shape[0]:
+        if warp_lane() == 0:
+            rows_out.count[p] = 0
+        return
+    while first < SLOT_ROOM:
+        k = first + warp_lane()
+        _ = next_place(found, k < SLOT_ROOM and is_first(slots, SLOT_ROOM * p + wp.min(k, SLOT_ROOM - 1)))
+        first += warp_size()
+    if warp_lane() == 0:
+        count = wp.min(SLOT_ROOM, found + wp.int32(wp.min(hits_inout.count[p], ALL_SLOTS)))
+        rows_out.count[p] = count
+        rows_out.start[p] = wp.atomic_add(hits_inout.witness_total, 0, count)
+
+
+@wp.kernel
+def list_witness_kernel(batch: PairBatch, slots: Slots, hits: Hits, rows_inout: WitnessRows):
+    """List what the slots of one object pair keep, by a warp; places that are left say so."""
+    p = wp.tid() / warp_size()
+    count = rows_inout.count[p]
+    if count == 0:
+        return
+    start, end, first = rows_inout.start[p], wp.int32(0), wp.int32(0)
+    if start < 0 or start > rows_inout.item.shape[0] - count:  # a launch that has lost work
+        if warp_lane() == 0:
+            rows_inout.count[p] = 0
+        return
+    swapped = batch.poses[p].swapped
+    while first < SLOT_ROOM:
+        k = SLOT_ROOM * p + wp.min(first + warp_lane(), SLOT_ROOM - 1)
+        kept = first + warp_lane() < SLOT_ROOM
+        if kept:
+            kept = is_first(slots, k)
+        place = next_place(end, kept)
+        if kept:
+            at = wp.int32(slots.key[k])
+            item = wp.vec3i(p, at & INDEX_MASK, 0)
+            if at >= 0:
+                row = hits.apart[at]
+                item = wp.vec3i(p | NEAR_BIT, row[1 + swapped], row[2 - swapped])
+            rows_inout.item[start + place] = item
+        first += warp_size()
+    k = end + warp_lane()
+    while k < count:
+        rows_inout.item[start + k] = wp.vec3i(-1, 0, 0)
+        k += warp_size()
