@@ -9,6 +9,7 @@ import warp as wp
 from bench import __main__ as main
 from bench.baselines.newton import SDF_RESOLUTION
 from bench.cases import budget, build, distance, host
+from bench.contacts import points
 from bench.tables import pick
 from warp_abtree import testing
 
@@ -146,6 +147,18 @@ def check_budget(rows):
         assert (row["error_max"] == 0) == (row["controller"] == "none") and row["cost_ms"] <= row["cost_p95_ms"]
         if row["controller"] == "none":
             assert row["cost_ms"] == pytest.approx(3.5 * row["budget_ms"], abs=0.01)
+
+
+def check_points(rows):
+    """The meshes may not be at hand."""
+    if "skipped" in rows[0]:
+        assert "ABTREE_MESHES" in rows[0]["skipped"]
+        return
+    assert [(row["case"], row["asked"]) for row in rows] == [(name, n) for name in points.LODS for n in points.ASKED]
+    for row in rows:
+        assert 0 < row["points"] <= row["asked"] < row["near"] and row["poses"] == row["worlds"] == 2
+        assert row["allowed_um"] <= row["worst_pose_um"] <= row["allowed_max_um"] <= 1e6 * 4 * points.GAP
+        assert row["one_ratio"] == pytest.approx(row["one_ms"] / row["faces_ms"], rel=0.02)
 
 
 def check_robot(rows):

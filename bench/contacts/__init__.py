@@ -1,0 +1,1 @@
+"""Contact points of nuts on bolts, and the penetration that they allow."""

@@ -1,0 +1,215 @@
+"""Contact points of parallel faces: normals at heights down to rounding, all corners, and bodies that slide there."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import slow
+from helpers.bodies import about, box, make
+from helpers.samples import STILL
+from oracles.triangle import quaternion_matrix
+
+import warp_abtree as ab
+from warp_abtree.checks.quaternions import multiply_quaternions
+
+GAP, TOLERANCE = 0.01, 1e-6
+UP = np.array([0, 0, 1.0])
+HEIGHTS = (-1e-9, 0.0, 1e-17, 1e-15, 1e-12, 1e-10, 1e-9, 1e-6, 1e-4, 1e-3)
+SIDE = 4.0  # of floors
+CELLS = {"2 faces": (1, 1), "200 faces": (10, 10), "2,000 faces": (32, 32), "24,000 faces": (100, 120)}
+COARSE = ("one huge face", "closed", "2 faces")
+FLOORS = (*COARSE, "closed, fine", "200 faces", "2,000 faces", "24,000 faces")
+QUICK_ON_MANY_FACES = (1e-12, 1e-4)  # heights above the last floor that take no long run
+FLOORS_AND_HEIGHTS = [(floor, height) for floor in FLOORS[:-1] for height in HEIGHTS]
+FLOORS_AND_HEIGHTS += [(FLOORS[-1], height) for height in QUICK_ON_MANY_FACES]
+LONG = [(FLOORS[-1], height) for height in HEIGHTS if height not in QUICK_ON_MANY_FACES]
+FLOORS_AND_HEIGHTS += [pytest.param(*each, marks=pytest.mark.slow) for each in LONG]
+# The object with the lower index, and the one that the pair names first.
+ORDERS = (("floor", "floor"), ("shape", "shape"), ("floor", "shape"))
+TILT = np.array([0.31, -0.52, 0.23, 0.76]) / np.linalg.norm([0.31, -0.52, 0.23, 0.76])
+
+
+def plain_model(vertices, faces):
+    """Return a model of one LOD."""
+    return ab.Model.from_arrays(np.asarray(vertices, float), np.asarray(faces), base_faces=len(faces))
+
+
+def open_floor(cells, low, high):
+    """Return a floor in the plane z = 0 of two faces a cell, between two corners."""
+    x, y = (np.linspace(a, b, n + 1) for a, b, n in zip(low, high, cells))
+    vertices = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((len(x), len(y)))], -1).reshape(-1, 3)
+    index = np.arange(len(vertices)).reshape(len(x), len(y))
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    faces = np.concatenate([np.stack(part, -1).reshape(-1, 3) for part in ((a, b, c), (a, c, d))])
+    return plain_model(vertices, faces)
+
+
+@cache
+def floor_of(name):
+    """Return a floor whose top is in the plane z = 0, and the longest edge of its faces there, 0 of few faces."""
+    if name in CELLS:
+        edge = SIDE * np.hypot(*(1 / np.array(CELLS[name])))
+        return open_floor(CELLS[name], (-SIDE / 2,) * 2, (SIDE / 2,) * 2), 0.0 if name in COARSE else edge
+    if name == "one huge face":
+        return plain_model([[-20, -20, 0], [30, -20, 0], [-20, 30, 0]], [[0, 1, 2]]), 0.0
+    mesh = trimesh.creation.box((SIDE, SIDE, 1))
+    mesh.apply_translation([0, 0, -0.5])
+    for _ in range(4 if name == "closed, fine" else 0):
+        mesh = mesh.subdivide()
+    return plain_model(mesh.vertices, mesh.faces), 0.0 if name == "closed" else SIDE * np.sqrt(2) / 16
+
+
+@cache
+def shapes():
+    """Return closed models by name, which stand on the plane z = 0, exactly."""
+    tetrahedron = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.25, 0.25, 0.7]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
+    meshes = {
+        "cube": trimesh.creation.box(),
+        "slab": trimesh.creation.box((1, 0.6, 0.1)),
+        "tetrahedron": trimesh.Trimesh(*tetrahedron, process=False),
+        "prism": trimesh.creation.cylinder(0.5, 0.4, sections=6),
+    }
+    return {name: plain_model(m.vertices - [0, 0, m.bounds[0, 2]], m.faces) for name, m in meshes.items()}
+
+
+def places():
+    """Return places on a floor and turns about z: along the edges of its faces, and any."""
+    rng = np.random.default_rng(3)
+    return [(0.0, 0.0, 0.0), *map(tuple, rng.uniform((-0.6, -0.6, 0), (0.6, 0.6, 2 * np.pi), (3, 3)).tolist())]
+
+
+def cases():
+    """Yield shape, place, whether all is tilted, and order."""
+    for name in shapes():
+        for place in places():
+            for tilted in (False, True):
+                for order in ORDERS:
+                    yield name, place, tilted, order
+
+
+def pose_of(place, height, tilted):
+    """Return the pose of a shape at a height above a floor.
+
+    That is exact where nothing is tilted. A tilted one is so high up to some 1e-15: at the least heights rounding says
+    on which side of the floor a corner is. What is asked of points is the same on either side.
+    """
+    x, y, turn = place
+    turned, origin = np.array(about(UP, turn)), np.array([x, y, height])
+    if tilted:
+        turned, origin = multiply_quaternions(TILT, turned), quaternion_matrix(TILT) @ origin
+    return np.array([*origin, *turned])
+
+
+@cache
+def find_points(device, floor, height):
+    """Return a list of the points of each case: positions and normals in the frame of the floor, the latter away from
+    the floor, and depths."""
+    scene, pairs = ab.Scene(device), []
+    for name, place, tilted, (lower, first) in cases():
+        placed = {
+            "floor": (floor_of(floor)[0], (0, 0, 0, *(TILT if tilted else STILL[3:]))),
+            "shape": (shapes()[name], pose_of(place, height, tilted)),
+        }
+        others = {"floor": "shape", "shape": "floor"}
+        index = {each: scene.add(placed[each][0], pose=placed[each][1]) for each in (lower, others[lower])}
+        pairs.append((index[first], index[others[first]]))
+    found = ab.ManifoldQuery(scene, pairs, gap=GAP).run()
+    np.testing.assert_array_equal(found.pairs, pairs)
+    listed = []
+    for p, (_, _, tilted, (_, first)) in enumerate(cases()):
+        own = found.points["pair"] == p
+        back = quaternion_matrix(TILT) if tilted else np.eye(3)
+        away = 1 if first == "floor" else -1
+        rows = found.points["point"][own] @ back, away * found.points["normal"][own] @ back
+        listed.append((*rows, found.points["depth"][own]))
+    return listed
+
+
+def corners_of(name, place):
+    """Return the corners of a shape's bottom above a floor, (n, 2)."""
+    vertices = shapes()[name].mesh_at(shapes()[name].lod_max)[0].astype(float)
+    bottom = vertices[:, 2] == 0
+    if name == "prism":  # the middle of its bottom is a vertex, and no corner
+        bottom &= np.hypot(*vertices.T[:2]) > 0.1
+    return (vertices[bottom] @ quaternion_matrix(about(UP, place[2])).T)[:, :2] + place[:2]
+
+
+def listed_faults(device, floor, height, fault_of):
+    """Return what a function says of the points of each case, where it says something, with the case."""
+    found = zip(cases(), find_points(device, floor, height), strict=True)
+    return [(*case, fault) for case, points in found if (fault := fault_of(case, *points))]
+
+
+@pytest.mark.parametrize(("floor", "height"), FLOORS_AND_HEIGHTS)
+def test_normals_are_those_of_the_floor(device, floor, height):
+    def fault_of(case, points, normals, depths):
+        if not len(normals):
+            return "no points"
+        angles = np.rad2deg(np.arctan2(np.linalg.norm(np.cross(normals, UP), axis=1), normals @ UP))
+        return f"{angles.max():.3g} degrees" if angles.max() > 1 else None
+
+    assert listed_faults(device, floor, height, fault_of) == []
+
+
+@pytest.mark.parametrize(("floor", "height"), FLOORS_AND_HEIGHTS)
+def test_every_corner_has_a_point(device, floor, height):
+    """On a floor of many faces a point stands for those within a face of it. Points lie between both surfaces."""
+
+    def fault_of(case, points, normals, depths):
+        corners = corners_of(*case[:2])
+        away = np.linalg.norm(corners[:, None] - points[:, :2], axis=2).min(1, initial=np.inf)
+        missed = int((away > max(TOLERANCE, floor_of(floor)[1])).sum())
+        high = (points[:, 2] > max(0, height) + TOLERANCE) | (points[:, 2] < min(0, height) - TOLERANCE)
+        return f"{missed} of {len(corners)} corners, {high.sum()} heights" if missed or high.any() else None
+
+    assert listed_faults(device, floor, height, fault_of) == []
+
+
+@pytest.mark.parametrize(("floor", "height"), FLOORS_AND_HEIGHTS)
+def test_depths_are_minus_the_height(device, floor, height):
+    def fault_of(case, points, normals, depths):
+        worst = np.abs(depths + height).max(initial=0)
+        return f"off by {worst:.3g}" if worst > TOLERANCE or not len(depths) else None
+
+    assert listed_faults(device, floor, height, fault_of) == []
+
+
+@cache
+def track(name):
+    """Return a floor that is long enough to slide on, its top in the plane z = 0."""
+    if name == "closed":
+        mesh = trimesh.creation.box((16, 8, 1)).apply_translation([0, 0, -0.5])
+        return plain_model(mesh.vertices, mesh.faces)
+    return open_floor({"open": (1, 1), "fine": (150, 80)}[name], (-8, -4), (8, 4))
+
+
+def slide(device, floor, start, speed, friction, rate):
+    """Return how far a cube slides along x in 2 s, and its velocity then; start is its x, height and turn about z."""
+    pose = (start[0], 0.03, 0.2 + start[1], *about(UP, start[2]))
+    bodies = make(
+        device,
+        (track(floor), STILL, True),
+        (box(0.4, 0.4, 0.4), pose),
+        friction=friction,
+        velocity=[(0, 0, 0), (speed, 0, 0)],
+    )
+    for _ in range(2 * rate):
+        bodies.step(1 / rate)
+    return bodies.poses()[1][0] - start[0], bodies.velocities()[0][1]
+
+
+@pytest.mark.parametrize("rate", [60, *slow(120, 240)])
+@pytest.mark.parametrize("floor", ["open", "closed", *slow("fine")])
+@pytest.mark.parametrize("turn", [0.0, 0.5])
+def test_a_cube_without_friction_keeps_its_speed(device, floor, rate, turn):
+    _, velocity = slide(device, floor, (-3, 0, turn), 2, 0.0, rate)
+    np.testing.assert_allclose(velocity, [2, 0, 0], atol=0.01)
+
+
+@pytest.mark.parametrize("rate", [60, *slow(120, 240)])
+@pytest.mark.parametrize("floor", ["open", "closed", *slow("fine")])
+@pytest.mark.parametrize("turn", [0.0, 0.5])
+def test_a_cube_set_down_too_high_slides_as_far_as_friction_says(device, floor, rate, turn):
+    way, _ = slide(device, floor, (-1, 1e-4, turn), 1, 0.3, rate)
+    assert way == pytest.approx(1 / (2 * 0.3 * 9.81), abs=0.02)
