@@ -219,7 +219,8 @@ def average_loop_kernel(
             # About the mean point, since for an open curve the area depends on where it is measured from.
             about = wp.cross(sums.middle / sums.total, sums.gap)
             n = (sums.area - wp.float64(0.5) * about) / (sums.total * sums.total)
-        if measure_length(n) <= LEAST_LOOP_AREA:
+        has_area = wp.where(measure_length(n) > LEAST_LOOP_AREA, 1, 0)
+        if has_area == 0:
             n = sums.mean
             if measure_length(sums.mean) <= LEAST_LOOP_AREA * sums.total:
                 n = sums.plain
@@ -229,4 +230,5 @@ def average_loop_kernel(
         begins = begins and warp_lane() != lane
         if warp_lane() == 0:
             curves_inout.loop_normal[order[first]] = unit_vector(n)
+            curves_inout.has_area[order[first]] = has_area
         lane = first_lane(begins)

@@ -9,6 +9,7 @@ from warp_abtree.kernels.contacts.contact import Contacts
 from warp_abtree.kernels.contacts.slots import HEADERS, Slots, WitnessRows, offer_point
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 from warp_abtree.kernels.triangle.corners import load_corners
+from warp_abtree.kernels.triangle.distance import largest_coordinate
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
 wp.set_module_options(native.options(*HEADERS))
@@ -22,6 +23,8 @@ FACING = wp.constant(wp.float64(0.1))
 LIKENESS = wp.constant(wp.float64(0.5))
 # By which part of a face's size its column is wider, so that walls that stand on its rim are inside.
 COLUMN_SLACK = wp.constant(wp.float64(2.0**-36))
+# Part of the size of faces that depths in a column err by.
+COLUMN_ROUNDING = wp.constant(wp.float64(2.0**-46))
 CLIPPED_CORNERS = wp.constant(8)
 # Candidates of a contact: a triangle within the column of another has so many corners at most.
 COLUMN_CORNERS = wp.constant(6)
@@ -37,6 +40,7 @@ class Curves:
     parent: wp.array(dtype=wp.int32)  # union-find forest of contacts, shape [contact]
     loop: wp.array(dtype=wp.int32)  # first contact of its loop, shape [contact]
     loop_normal: wp.array(dtype=wp.vec3d)  # at the first contact of each loop, shape [contact]
+    has_area: wp.array(dtype=wp.int32)  # there, 1 where the normal is that of an area, else 0, shape [contact]
 
 
 @wp.struct
@@ -98,6 +102,15 @@ def clip_column(
             polygon[i] = clipped[i]
             i += 1
     return count
+
+
+@wp.func
+def column_slack(corner: wp.array(dtype=wp.vec3d)):
+    """Return what depths in a column err by at most: a part of the size of both faces."""
+    size = wp.float64(0.0)
+    for k in range(5):
+        size = wp.max(size, largest_coordinate(corner[k + 1] - corner[0]))
+    return COLUMN_ROUNDING * size
 
 
 @wp.struct
@@ -183,6 +196,15 @@ def write_middle(w: wp.int32, i: wp.int32, n: wp.vec3d, contacts: Contacts, witn
     witnesses.point[w, 1] = contacts.p1[i]
 
 
+@wp.func
+def lies_in_front(n: wp.vec3d, face: wp.int32, corner: wp.array(dtype=wp.vec3d), slack: wp.float64):
+    """Return whether a face lies in front of the plane of that at corners face .. face + 2, whose normal is n."""
+    least = wp.float64(wp.inf)
+    for k in range(3):
+        least = wp.min(least, wp.dot(n, corner[3 - face + k] - corner[face]))
+    return least >= -slack and wp.dot(n, n) > wp.float64(0.0)
+
+
 @wp.struct
 class Crossing:
     """A contact of faces that cross, to find its candidates."""
@@ -222,15 +244,30 @@ def measure_crossing(
     """Find the normal and the candidate points of a contact of faces that cross, in A's frame.
 
     Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least; of
-    both faces' normals where neither is like it and one looks the other way.
+    both faces' normals where neither is like it and one looks the other way. Where faces merely touch, the normal of a
+    face that has the other in front serves, if it is like the loop's or that has no area, as rounding may have made it;
+    edges beside one another have none then.
     """
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
     load_corners(trees, pose, crossing.faces[1 + pose.swapped], crossing.faces[2 - pose.swapped], corner)
     back = wp.transpose(trees.objects.rotation[crossing.a])
     normal_a = back * contacts.normal_a[crossing.i]
     normal_b = back * contacts.normal_b[crossing.i]
-    first, zero, least = 3 * pose.swapped, wp.float64(0.0), crossing.least
+    first, least, slack = 3 * pose.swapped, crossing.least, column_slack(corner)
     loop = back * curves.loop_normal[curves.loop[crossing.i]]
+    touches_a = lies_in_front(normal_a, first, corner, slack)
+    touches_b = lies_in_front(normal_b, 3 - first, corner, slack)
+    if curves.has_area[curves.loop[crossing.i]] != 0:
+        touches_a = touches_a and wp.dot(loop, normal_a) > LIKENESS
+        touches_b = touches_b and -wp.dot(loop, normal_b) > LIKENESS
+    if touches_a and touches_b and -wp.dot(normal_a, normal_b) < LIKENESS:
+        none = Column()
+        none.normal = loop
+        none.depth = NO_DEPTH
+        return none
+    if touches_a or touches_b:
+        n = wp.where(touches_a, normal_a, -normal_b)
+        return measure_column(corner, n, normal_a, normal_b, first, wp.min(least, -slack), point, depth)
     best = measure_column(corner, loop, normal_a, normal_b, first, least, point, depth)
     written = bool(True)
     toward_a, toward_b = wp.dot(loop, normal_a), -wp.dot(loop, normal_b)
@@ -240,8 +277,8 @@ def measure_crossing(
     for k in range(2):
         m = wp.where(k == 0, normal_a, -normal_b)
         if contrary or wp.dot(m, loop) > LIKENESS:
-            other = measure_column(corner, m, normal_a, normal_b, first, least, point, depth)
-            written = other.depth >= zero and (best.depth < zero or other.depth <= best.depth)
+            other = measure_column(corner, m, normal_a, normal_b, first, wp.min(least, -slack), point, depth)
+            written = other.depth >= -slack and (best.depth < -slack or other.depth <= best.depth + slack)
             if written:
                 best = other
     if not written and best.depth > NO_DEPTH:

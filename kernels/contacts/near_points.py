@@ -18,6 +18,7 @@ from warp_abtree.kernels.contacts.manifold import (
     NO_DEPTH,
     NO_POINT,
     Witnesses,
+    column_slack,
     measure_column,
     write_candidates,
 )
@@ -25,7 +26,6 @@ from warp_abtree.kernels.contacts.separation import write_near_contact
 from warp_abtree.kernels.contacts.slots import HEADERS, WitnessRows
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK, Hits
 from warp_abtree.kernels.triangle.corners import load_corners
-from warp_abtree.kernels.triangle.distance import largest_coordinate
 
 wp.set_module_options(native.options(*HEADERS))
 
@@ -35,8 +35,6 @@ OPPOSED_LEAST = wp.constant(wp.float64(0.5))
 ALIKE = wp.constant(wp.float64(2.0**-10))
 # Cosine between a face's normal and the direction of the distance under which the gap differs by more than `ALIKE`.
 ALONG = wp.constant(wp.float64(0.998))
-# Part of the size of faces that a gap along a normal errs by.
-COLUMN_ROUNDING = wp.constant(wp.float64(2.0**-46))
 
 
 @wp.func
@@ -61,15 +59,6 @@ def write_nearest_points(
         middle = (first + back * (contacts.p1[w] - position) * pose.scale) * (wp.float64(0.5) / pose.scale)
         witnesses.depth[w, 0] = -contacts.separation[w]
         witnesses.point[w, 0] = pose_point(rotation, position, middle)
-
-
-@wp.func
-def faces_size(corner: wp.array(dtype=wp.vec3d)):
-    """Return the largest coordinate, in magnitude, of the differences of two faces' corners from the first."""
-    size = wp.float64(0.0)
-    for k in range(5):
-        size = wp.max(size, largest_coordinate(corner[k + 1] - corner[0]))
-    return size
 
 
 @wp.func
@@ -99,7 +88,7 @@ def write_facing(
     depth = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.float64)
     normal_a, normal_b = back * contacts.normal_a[w], back * contacts.normal_b[w]
     first, separation = 3 * pose.swapped, contacts.separation[w]
-    slack = wp.max(ALIKE * separation, COLUMN_ROUNDING * faces_size(corner))
+    slack = wp.max(ALIKE * separation, column_slack(corner))
     best = measure_column(corner, -normal_b, normal_a, normal_b, first, -gap, point, depth)
     # A gap wider than the distance stays so whatever the other normal says.
     if best.depth == NO_DEPTH or -best.depth - separation <= slack:

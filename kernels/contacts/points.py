@@ -1,6 +1,8 @@
 """Contact reduction: the points of an object pair that its violated motions choose.
 
-Of a set of fixed twists of the second object, each goes as far as the points chosen allow, and no farther than a limit.
+Of a set of twists of the second object, each goes as far as the points chosen allow, and no farther than a limit: fixed
+ones, and turns about lines at the rim of the candidates, across the normal of the deepest one and of that whose normal
+is most against it, since a random motion seldom is one that a single corner stops.
 The candidate that any of them takes deepest into the other object is the next point, until none is taken in. So the
 points chosen are about as good as all candidates in what they allow, for any motion. The deepest candidate is among
 them, or one about as deep.
@@ -18,7 +20,7 @@ from warp_abtree.kernels.contacts.candidates import ObjectPose, group_lane, grou
 from warp_abtree.kernels.contacts.manifold import COLUMN_CORNERS, NO_DEPTH, Manifolds, Witnesses
 from warp_abtree.kernels.contacts.slots import WitnessRows
 
-TWIST_COUNT = native.constant("TWIST_COUNT")
+TWIST_COUNT, RANDOM_TWISTS = native.constant("TWIST_COUNT"), native.constant("RANDOM_TWISTS")
 MODULE_OPTIONS = native.options("contacts/twists.cuh") | {"block_dim": TWIST_COUNT}
 wp.set_module_options(MODULE_OPTIONS)
 

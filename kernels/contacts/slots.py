@@ -1,7 +1,8 @@
 """Slots: contact witnesses of an object pair, those face pairs that a choice of contact points needs.
 
-The normal of a contact is in one of 20 bins. Each bin has a slot for the deepest contact and six for those that lie
-farthest in six directions across the normal, with their depth, so that what is at the rim of a contact is kept. A slot
+The normal of a contact is in one of 20 bins. Each bin has a slot for the deepest contact and eight for those that lie
+farthest in eight directions across the normal, with their depth, so that what is at the rim of a contact is kept: of
+contacts that cross, and again of those apart; and a slot for the deepest of those that are apart, but inside. A slot
 keeps the witness of the highest score; which one depends on what was offered alone, not on the order, and is the same
 on every device. Bins of normals with extreme points are what contact reductions of physics engines keep, too (Newton,
 PhysX).

@@ -144,13 +144,18 @@ constexpr double CLOSEST = 0x1p-60;
 constexpr double LEAST_SINE_SQUARED = 0x1p-40;
 constexpr int CHUNK = 32;
 
-// Twists by which contact points are chosen: one a thread of a block.
+// Twists by which contact points are chosen, one a thread of a block: random ones, then turns about lines at the rim.
 constexpr int TWIST_COUNT = 256;
+constexpr int RANDOM_TWISTS = 192;
+static_assert(RANDOM_TWISTS % 32 == 0 && TWIST_COUNT % 32 == 0, "vectors and halves of turns are whole");
 
-// Slots of near faces of an object pair: bins of normals, of each the nearest and the farthest in six directions.
+// Slots of the contact witnesses of an object pair: bins of normals, of each the deepest and the farthest in eight
+// directions, of what crosses and of what is apart, and the deepest of what is apart inside.
 constexpr int NORMAL_BINS = 20;
-constexpr int SLOTS_A_BIN = 7;
-constexpr int SLOT_ROOM = 140;
+constexpr int SCORES = 9;
+constexpr int SLOTS_A_BIN = 19;
+constexpr int SLOT_ROOM = 380;
+static_assert(SLOTS_A_BIN == 2 * SCORES + 1, "no gap");
 static_assert(SLOT_ROOM == NORMAL_BINS * SLOTS_A_BIN, "no gap");
 
 // Certified errors: faces about a merge, distances of corners to them, corners of a polygon, polygons on the stack,

@@ -25,9 +25,6 @@ void simd_offer_list(const ModelPool& models, const StatePool& states, wp::array
         const O::Scores scores = O::rate(corners, measures.data[pair][0], measures.data[pair][1], directions.data);
         wp::int64* const own = slots.data + (wp::int64)pair * SLOT_ROOM;
         for (int i = 0; i < some; ++i)
-            for (int k = 0; k < SLOTS_A_BIN; ++k)
-                if (scores.score[k][i] > NO_SCORE)
-                    put_into_slot(own + SLOTS_A_BIN * (scores.bin[i] / 9) + k,
-                                  make_slot_key(scores.score[k][i], first + i), list.data);
+            O::put(scores, i, first + i, own, list.data);
     }
 }

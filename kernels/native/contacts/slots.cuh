@@ -1,4 +1,4 @@
-// Slots of contact witnesses: bins of normals, of each the deepest and those that lie farthest in six directions.
+// Slots of contact witnesses: bins of normals, of each the deepest and those that lie farthest in eight directions.
 #pragma once
 #include "builtin.h"
 #include "base/sizes.h"
@@ -43,7 +43,7 @@ struct SlotScores {
     };
     I bin;
     Vector across[2];
-    L score[SLOTS_A_BIN];
+    L score[SCORES];
 
     static CUDA_CALLABLE L dot(const Vector& u, const Vector& v) {
         return fuse_any(u.x, v.x, fuse_any(u.y, v.y, u.z * v.z));
@@ -64,17 +64,15 @@ struct SlotScores {
             const float* d = directions + 3 + 3 * k;
             across[k] = Vector{pick(d, bin), pick(d + 1, bin), pick(d + 2, bin)};
         }
-        for (int k = 0; k < SLOTS_A_BIN; ++k)
+        for (int k = 0; k < SCORES; ++k)
             score[k] = none;
     }
     CUDA_CALLABLE void offer(float weight, const Vector& point, const L& separation, const B& counts) {
         const L x = dot(across[0], point) * weight, y = dot(across[1], point) * weight, depth = -separation;
-        const L half = x * 0.5f, high = y * 0.8660254f, none = L{} + NO_SCORE;
-        const L along[SLOTS_A_BIN] = {depth,           depth + x,
-                                      depth - x,       depth + (half + high),
-                                      depth + (high - half), depth - (half + high),
-                                      depth - (high - half)};
-        for (int k = 0; k < SLOTS_A_BIN; ++k) {
+        const L sum = (x + y) * 0.70710678f, difference = (x - y) * 0.70710678f, none = L{} + NO_SCORE;
+        const L along[SCORES] = {depth,     depth + x,   depth - x,          depth + y,         depth - y,
+                                      depth + sum, depth - sum, depth + difference, depth - difference};
+        for (int k = 0; k < SCORES; ++k) {
             const L found = counts ? along[k] : none;
             score[k] = found > score[k] ? found : score[k];
         }
@@ -127,7 +125,7 @@ inline CUDA_CALLABLE void offer_point(wp::vec_t<3, wp::float32> normal, wp::vec_
     Scores scores({normal[0], normal[1], normal[2]}, directions.data);
     scores.offer(weight, {point[0], point[1], point[2]}, separation, true);
     wp::int64* const slot = slots.data + (wp::int64)pair * SLOT_ROOM + SLOTS_A_BIN * (scores.bin / 9);
-    for (int k = 0; k < SLOTS_A_BIN; ++k)
+    for (int k = 0; k < SCORES; ++k)
         put_into_slot(slot + k, make_slot_key(scores.score[k], CROSSING_BIT | (unsigned int)place), list.data);
 }
 
@@ -143,7 +141,11 @@ struct NearOffer {
 #else
     typedef bits integers;
 #endif
-    typedef SlotScores<lanes, bits, integers> Scores;
+    struct Scores : SlotScores<lanes, bits, integers> {
+        typedef SlotScores<lanes, bits, integers> Base;
+        bits inside;
+        CUDA_CALLABLE Scores(const Vector& n, const float* directions) : Base(n, directions) {}
+    };
 
     static CUDA_CALLABLE Point unit_normal(const Point (&c)[3]) {
         const Point n = N::cross_exactly(F::minus(c[1], c[0]), F::minus(c[2], c[0]));
@@ -178,7 +180,7 @@ struct NearOffer {
             offer(Point{-v.x, -v.y, -v.z}, point);
         }
     };
-    static CUDA_CALLABLE typename Scores::Vector vector_of(const Point& p) { return {p.x, p.y, p.z}; }
+    static CUDA_CALLABLE Scores::Vector vector_of(const Point& p) { return {p.x, p.y, p.z}; }
     static CUDA_CALLABLE Scores rate(const N::Corners& c, float gap, float weight, const float* directions) {
         const lanes zero = {};
         Joined joined;
@@ -192,18 +194,47 @@ struct NearOffer {
         const bits facing = F::dot(joined.normal_a, joined.normal_b) <= LOOKS_AT;
         // Along a normal, or so near that normals tell the direction.
         const lanes most = N::most(F::absolute(ahead_a), F::absolute(ahead_b));
-        const bits column = facing & (most >= distance * 0.99f), along = column | (distance <= size * 0x1p-20f);
-        const bits inside = column & (ahead_a < 0.0f) & (ahead_b < 0.0f);
+        const bits touches = distance <= size * 0x1p-20f, column = facing & (touches | (most >= distance * 0.99f));
+        const bits along = column | touches, inside = column & (distance > size * 0x1p-20f) & (ahead_a < 0.0f) & (ahead_b < 0.0f);
         const lanes separation = inside ? -distance : distance, least = distance * 0x1p-6f;
-        const bits counts = (distance <= gap) & (along | ((ahead_a > least) & (ahead_b > least)));
+        // What lies deeper inside than its distance is not measured by it (`near_points`).
+        lanes lowest = zero;
+        for (int k = 0; k < 6; ++k)
+            lowest = joined.height[k] < lowest ? joined.height[k] : lowest;
+        const bits fits = (separation >= 0.0f) | (-lowest <= distance * (1.0f + 0x1p-10f) + size * 0x1p-20f);
+        const bits counts = (distance <= gap) & fits & (along | ((ahead_a > least) & (ahead_b > least)));
         const Point n = F::choose(along, F::minus(joined.normal_a, joined.normal_b), joined.way);
         Scores scores(vector_of(n), directions);
-        scores.offer(weight, vector_of(N::add(joined.at, zero + 0.5f, joined.way)), separation, counts);
+        scores.inside = inside;
+        // What touches beside a column, perhaps looking away, goes behind all that is in one.
+        const lanes rank = column ? separation : separation + (along ? zero + gap : zero);
+        scores.offer(weight, vector_of(N::add(joined.at, zero + 0.5f, joined.way)), rank, counts);
         for (int k = 0; k < 6; ++k) {
             const bits near = (joined.height[k] <= gap) & (joined.height[k] >= -gap);
-            scores.offer(weight, vector_of(joined.corner[k]), joined.height[k], counts & column & near);
+            scores.offer(weight, vector_of(joined.corner[k]), joined.height[k], counts & column & (separation >= 0.0f) & near);
         }
         return scores;
+    }
+    // Puts the scores of a lane into the slots of its object pair: of what is inside the deepest alone.
+    static CUDA_CALLABLE void put(const Scores& scores, int lane, int place, wp::int64* slots,
+                                  const wp::vec_t<3, wp::int32>* list) {
+#if defined(__CUDA_ARCH__)
+        const int bin = scores.bin / 9;
+        const bool inside = scores.inside;
+#else
+        const int bin = scores.bin[lane] / 9;
+        const bool inside = scores.inside[lane] != 0;
+#endif
+        wp::int64* const slot = slots + SLOTS_A_BIN * bin + (inside ? 2 * SCORES : SCORES);
+        for (int k = 0; k < (inside ? 1 : SCORES); ++k) {
+#if defined(__CUDA_ARCH__)
+            const float score = scores.score[k];
+#else
+            const float score = scores.score[k][lane];
+#endif
+            if (score > NO_SCORE)
+                put_into_slot(slot + k, make_slot_key(score, place), list);
+        }
     }
 };
 
@@ -219,15 +250,5 @@ CUDA_CALLABLE void offer_faces(const Corners& a, const Corners& b, wp::float32 g
         c.b[k] = O::Point{zero + b.data[k][0], zero + b.data[k][1], zero + b.data[k][2]};
     }
     const O::Scores scores = O::rate(c, gap, weight, directions.data);
-#if defined(__CUDA_ARCH__)
-    const int bin = scores.bin / 9;
-#else
-    const int bin = scores.bin[0] / 9;
-#endif
-    wp::int64* const slot = slots.data + (wp::int64)pair * SLOT_ROOM + SLOTS_A_BIN * bin;
-    for (int k = 0; k < SLOTS_A_BIN; ++k) {
-        const float score = O::F::first(scores.score[k]);
-        if (score > NO_SCORE)
-            put_into_slot(slot + k, make_slot_key(score, place), list.data);
-    }
+    O::put(scores, 0, place, slots.data + (wp::int64)pair * SLOT_ROOM, list.data);
 }

@@ -5,6 +5,14 @@
 #include "base/sizes.h"
 #include "contacts/groups.cuh"
 
+inline CUDA_CALLABLE float fuse_numbers(float a, float b, float c) {
+#if defined(__CUDA_ARCH__)
+    return __fmaf_rn(a, b, c);
+#else
+    return __builtin_fmaf(a, b, c);
+#endif
+}
+
 struct TwistChoice {
     typedef Float32 F;
     typedef F::lanes lanes;
@@ -38,6 +46,7 @@ struct TwistChoice {
         Point normal, moment;
         lanes separation;
     };
+    static constexpr float RIM = 0.95f;
     const wp::vec_t<4, float>* wrenches;
     int first, end;
 
@@ -59,6 +68,31 @@ struct TwistChoice {
             t.candidate = deeper ? integers{} + k : t.candidate;
         }
     }
+    // Turns about a line across a normal, at the rim of the candidates in a direction: what only the outermost of them
+    // stop. The first two components of a twist are the direction's, along two vectors across the normal.
+    CUDA_CALLABLE void tilt(Twists& t, const float (&n)[3]) const {
+        const int least = fabsf(n[0]) <= fabsf(n[1]) ? (fabsf(n[0]) <= fabsf(n[2]) ? 0 : 2)
+                                                     : (fabsf(n[1]) <= fabsf(n[2]) ? 1 : 2);
+        float u[3] = {least == 0 ? 0.0f : least == 1 ? -n[2] : n[1], least == 0 ? n[2] : least == 1 ? 0.0f : -n[0],
+                      least == 0 ? -n[1] : least == 1 ? n[0] : 0.0f};
+        const float length = sqrtf(u[0] * u[0] + u[1] * u[1] + u[2] * u[2]);
+        for (int k = 0; k < 3; ++k)
+            u[k] = length > 0.0f ? u[k] / length : 0.0f;
+        const float v[3] = {n[1] * u[2] - n[2] * u[1], n[2] * u[0] - n[0] * u[2], n[0] * u[1] - n[1] * u[0]};
+        // Across the direction: n x (c u + s v) = c v - s u.
+        const lanes c = t.linear.x, s = t.linear.y, zero = {};
+        t.angular = Point{c * v[0] - s * u[0], c * v[1] - s * u[1], c * v[2] - s * u[2]};
+        t.linear = Point{zero, zero, zero};
+        lanes reach = zero;
+        for (int k = first; k < end; ++k) {
+            const lanes out = -rate_of(t, get(k));
+            reach = out > reach ? out : reach;
+        }
+        reach = reach * RIM;
+        const lanes size = F::root(F::fuse(reach, reach, zero + 1.0f));
+        t.linear = Point{reach * n[0] / size, reach * n[1] / size, reach * n[2] / size};
+        t.angular = Point{t.angular.x / size, t.angular.y / size, t.angular.z / size};
+    }
     // Lets a candidate stop the twists that go against it.
     CUDA_CALLABLE void block(Twists& t, const Wrench& c) const {
         const lanes rate = rate_of(t, c), closing = -rate;
@@ -75,26 +109,43 @@ CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec_t<4, wp::float32>> 
                                          wp::float32 tolerance, wp::float32 deep, wp::int32 most, Array chosen) {
     typedef TwistChoice T;
     const T choice = {wrenches.data, first, end};
-    T::Twists twist[T::GROUPS];
-    const T::lanes zero = {};
-    for (int g = 0; g < T::GROUPS; ++g) {
-        T::lanes x[6];
-        for (int k = 0; k < 6; ++k)
-            x[k] = T::load(twists.data + TWIST_COUNT * k + T::LANES * g);
-        twist[g].linear = T::Point{x[0], x[1], x[2]};
-        twist[g].angular = T::Point{x[3], x[4], x[5]};
-        twist[g].stop = zero + limit;
-        choice.find_worst(twist[g]);
-    }
-    // The nearest candidate, the first of several, which must be among those chosen or about as near as one.
-    float nearest = -0x1p126f, reached = 0x1p126f;
-    int nearest_at = first;
+    // The nearest candidate, the first of several, which must be among those chosen or about as near as one; and that
+    // whose normal is most against its own.
+    float nearest = -0x1p126f, reached = 0x1p126f, against = -0x1p126f;
+    int nearest_at = first, against_at = first;
     for (int k = first + group_lane(); k < end; k += group_size())
         if (-wrenches.data[2 * k][3] > nearest) {
             nearest = -wrenches.data[2 * k][3];
             nearest_at = k;
         }
     find_greatest(nearest, nearest_at);
+    const wp::vec_t<4, float>& own = wrenches.data[2 * nearest_at];
+    for (int k = first + group_lane(); k < end; k += group_size()) {
+        const wp::vec_t<4, float>& n = wrenches.data[2 * k];
+        const float other = -fuse_numbers(own[0], n[0], fuse_numbers(own[1], n[1], own[2] * n[2]));
+        if (other > against) {
+            against = other;
+            against_at = k;
+        }
+    }
+    find_greatest(against, against_at);
+    T::Twists twist[T::GROUPS];
+    const T::lanes zero = {};
+    for (int g = 0; g < T::GROUPS; ++g) {
+        const int number = T::LANES == 1 ? group_lane() : T::LANES * g;
+        T::lanes x[6];
+        for (int k = 0; k < 6; ++k)
+            x[k] = T::load(twists.data + TWIST_COUNT * k + T::LANES * g);
+        twist[g].linear = T::Point{x[0], x[1], x[2]};
+        twist[g].angular = T::Point{x[3], x[4], x[5]};
+        if (number >= RANDOM_TWISTS) {
+            const int turns = RANDOM_TWISTS + (TWIST_COUNT - RANDOM_TWISTS) / 2;
+            const wp::vec_t<4, float>& n = wrenches.data[2 * (number < turns ? nearest_at : against_at)];
+            choice.tilt(twist[g], {n[0], n[1], n[2]});
+        }
+        twist[g].stop = zero + limit;
+        choice.find_worst(twist[g]);
+    }
     int count = 0;
     while (count < most) {
         float depth = -0x1p126f;

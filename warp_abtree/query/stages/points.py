@@ -66,10 +66,18 @@ POINT_FIELDS = {"point": wp.vec3d, "normal": wp.vec3d, "depth": wp.float64}
 
 
 def make_twists() -> np.ndarray:
-    """Return the twists by which points are chosen: random unit vectors of six components, by component, float32."""
+    """Return the twists by which points are chosen, by component, float32 (6 TWIST_COUNT,).
+
+    Random unit vectors of six components, then directions in a plane, of turns about lines at the rim of candidates.
+    """
+    random, turns = point_kernels.RANDOM_TWISTS, (point_kernels.TWIST_COUNT - point_kernels.RANDOM_TWISTS) // 2
+    twists = np.zeros((point_kernels.TWIST_COUNT, 6))
     # The legacy generator, whose numbers are the same for good.
-    twists = np.random.RandomState(0).normal(size=(point_kernels.TWIST_COUNT, 6))
-    return (twists / np.linalg.norm(twists, axis=1)[:, None]).T.astype(np.float32).ravel()
+    twists[:random] = np.random.RandomState(0).normal(size=(random, 6))
+    twists[:random] /= np.linalg.norm(twists[:random], axis=1)[:, None]
+    angles = np.tile(np.arange(turns) * 2 * np.pi / turns, 2)
+    twists[random:, :2] = np.stack([np.cos(angles), np.sin(angles)], 1)
+    return twists.T.astype(np.float32).ravel()
 
 
 class PointStage(Stage):
@@ -103,7 +111,7 @@ class PointStage(Stage):
         witnesses, room = self.witnesses, self._slots.room(rooms)
         near = fields(self.near, room, **dict.fromkeys(VECTORS, wp.vec3d), coplanar=wp.int32, separation=wp.float64)
         return [
-            *fields(self.curves, rooms.hits, parent=wp.int32, loop=wp.int32, loop_normal=wp.vec3d),
+            *fields(self.curves, rooms.hits, parent=wp.int32, loop=wp.int32, loop_normal=wp.vec3d, has_area=wp.int32),
             *fields(witnesses, (room, CANDIDATES), point=wp.vec3d, depth=wp.float64),
             *fields(witnesses, room, normal=wp.vec3d, unsure=wp.int32),
             Array(witnesses, "wrench", wp.vec4, 2 * CANDIDATES * room),
