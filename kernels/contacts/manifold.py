@@ -6,13 +6,13 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.contacts.contact import Contacts
-from warp_abtree.kernels.contacts.slots import HEADERS, Slots, WitnessRows, offer_point
+from warp_abtree.kernels.contacts.slots import Slots, WitnessRows, offer_point
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 from warp_abtree.kernels.triangle.corners import load_corners
 from warp_abtree.kernels.triangle.distance import largest_coordinate
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
-wp.set_module_options(native.options(*HEADERS))
+wp.set_module_options(native.options("contacts/slots.cuh"))
 
 POINTS = wp.constant(8)
 """Points that stand for a pair, unless told otherwise."""
@@ -50,7 +50,7 @@ class Witnesses:
     normal: wp.array(dtype=wp.vec3d)  # unit, from the pair's first object to its second, shape [witness]
     point: wp.array2d(dtype=wp.vec3d)  # [world units], shape [witness, COLUMN_CORNERS]
     depth: wp.array2d(dtype=wp.float64)  # [world units], NO_DEPTH or NO_POINT, shape [witness, COLUMN_CORNERS]
-    unsure: wp.array(dtype=wp.int32)  # whether another face may be nearer, 0 or 1, shape [witness]
+    nearest_only: wp.array(dtype=wp.int32)  # whether another face may be nearer, 0 or 1, shape [witness]
     wrench: wp.array(dtype=wp.vec4)  # see `candidates`, shape [2 * COLUMN_CORNERS * witness]
 
 

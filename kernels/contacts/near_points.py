@@ -23,11 +23,11 @@ from warp_abtree.kernels.contacts.manifold import (
     write_candidates,
 )
 from warp_abtree.kernels.contacts.separation import write_near_contact
-from warp_abtree.kernels.contacts.slots import HEADERS, WitnessRows
+from warp_abtree.kernels.contacts.slots import WitnessRows
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK, Hits
 from warp_abtree.kernels.triangle.corners import load_corners
 
-wp.set_module_options(native.options(*HEADERS))
+wp.set_module_options(native.options())
 
 # A face's normal serves where the other face looks against it within 60 degrees.
 OPPOSED_LEAST = wp.constant(wp.float64(0.5))
@@ -35,6 +35,12 @@ OPPOSED_LEAST = wp.constant(wp.float64(0.5))
 ALIKE = wp.constant(wp.float64(2.0**-10))
 # Cosine between a face's normal and the direction of the distance under which the gap differs by more than `ALIKE`.
 ALONG = wp.constant(wp.float64(0.998))
+
+# Distance, at unit size, under which faces touch.
+NO_DISTANCE = wp.constant(wp.float64(2.0**-30))
+# Cosine between the direction of a distance and a face's normal from which on the face does not look away from it; one
+# that is closer to the plane of one face of an edge is far from that of the other.
+LEAST_AHEAD = wp.constant(wp.float64(2.0**-10))
 
 
 @wp.func
@@ -49,12 +55,12 @@ def write_nearest_points(
     rotation, position = objects.rotation[a], objects.position[a]
     back = wp.transpose(rotation)
     n = contacts.normal[w]
-    ahead = wp.dot(n, contacts.normal_a[w]) > wp.float64(0.0) and wp.dot(n, contacts.normal_b[w]) < wp.float64(0.0)
+    ahead = wp.dot(n, contacts.normal_a[w]) > LEAST_AHEAD and wp.dot(n, contacts.normal_b[w]) < -LEAST_AHEAD
     for k in range(COLUMN_CORNERS):
         witnesses.depth[w, k] = NO_POINT
     witnesses.normal[w] = n
     if ahead:
-        witnesses.unsure[w] = 1
+        witnesses.nearest_only[w] = 1
         first = back * (contacts.p0[w] - position) * pose.scale
         middle = (first + back * (contacts.p1[w] - position) * pose.scale) * (wp.float64(0.5) / pose.scale)
         witnesses.depth[w, 0] = -contacts.separation[w]
@@ -99,7 +105,7 @@ def write_facing(
             best = other
     serves = wp.abs(wp.abs(best.depth) - separation) <= slack
     if serves:
-        witnesses.unsure[w] = wp.where(best.depth > slack, 1, 0)
+        witnesses.nearest_only[w] = wp.where(best.depth > slack, 1, 0)
         write_candidates(w, rotation, trees.objects.position[a], best, -gap, point, depth, witnesses)
     return serves
 
@@ -128,7 +134,7 @@ def find_near_witness_kernel(
     if w >= wp.min(hits.witness_total[0], rows.item.shape[0]):
         return
     item = rows.item[w]
-    witnesses_out.unsure[w] = 0
+    witnesses_out.nearest_only[w] = 0
     if item[0] < NEAR_BIT:
         return
     p = item[0] & PAIR_MASK
@@ -137,12 +143,13 @@ def find_near_witness_kernel(
     write_near_contact(w, trees, own, pose, item, contacts_out)
     n, normal_a, normal_b = contacts_out.normal[w], contacts_out.normal_a[w], contacts_out.normal_b[w]
     along = wp.max(wp.abs(wp.dot(n, normal_a)), wp.abs(wp.dot(n, normal_b)))
-    served = bool(False)
+    # Of what touches rounding may tell the direction.
+    served, touch = bool(False), contacts_out.separation[w] * pose.scale < NO_DISTANCE
     if contacts_out.separation[w] >= gap[p]:
         for k in range(COLUMN_CORNERS):
             witnesses_out.depth[w, k] = NO_POINT
         served = bool(True)
-    elif -wp.dot(normal_a, normal_b) >= OPPOSED_LEAST and along >= ALONG:
+    elif -wp.dot(normal_a, normal_b) >= OPPOSED_LEAST and (along >= ALONG or touch):
         served = write_facing(w, gap[p], trees, own.a, pose, item, contacts_out, witnesses_out)
     if not served:
         write_nearest_points(w, trees.objects, own.a, pose, contacts_out, witnesses_out)

@@ -25,15 +25,14 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
-from warp_abtree.kernels.base.lanes import next_place, warp_lane, warp_size
+from warp_abtree.kernels.base.lanes import next_place, warp_lane, warp_size, warp_sync
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 from warp_abtree.kernels.search.item import INDEX_MASK
 from warp_abtree.kernels.triangle.distance_bounds import load_points, three_points
 
-HEADERS = "base/counters.cuh", "base/lanes.cuh", "contacts/slots.cuh", "contacts/offer_list.h"
-wp.set_module_options(native.options(*HEADERS))
+wp.set_module_options(native.options("base/lanes.cuh", "contacts/near_offer.cuh", "contacts/offer_list.h"))
 
 NORMAL_BINS, SLOTS_A_BIN, SLOT_ROOM = (native.constant(name) for name in ("NORMAL_BINS", "SLOTS_A_BIN", "SLOT_ROOM"))
 ALL_SLOTS = wp.constant(wp.int64(SLOT_ROOM))
@@ -106,7 +105,7 @@ def simd_offer_list(
 
 
 @wp.func
-def size_of(trees: Trees, state: wp.int32):
+def tree_size(trees: Trees, state: wp.int32):
     """Return half of the diagonal of the root box of a tree state."""
     root = load_node(trees.states, trees.states.node_start[state] + 1)
     return wp.float64(0.5) * wp.length(wp.vec3d(root.upper) - wp.vec3d(root.lower))
@@ -131,7 +130,7 @@ def start_slots_kernel(
         if gap.shape[0] > 0:
             shell = gap[p]
         a, b = trees.objects.state[batch.pairs[p][0]], trees.objects.state[batch.pairs[p][1]]
-        size = wp.min(size_of(trees, a), size_of(trees, b))
+        size = wp.min(tree_size(trees, a), tree_size(trees, b))
         weight = WEIGHT_LEAST
         if shell > WEIGHT_LEAST * size:
             weight = wp.min(shell, size) / wp.max(size, wp.min(shell, size))
@@ -200,12 +199,11 @@ def list_witness_kernel(batch: PairBatch, slots: Slots, hits: Hits, rows_inout: 
     count = rows_inout.count[p]
     if count == 0:
         return
+    room = rows_inout.item.shape[0]
     start, end, first = rows_inout.start[p], wp.int32(0), wp.int32(0)
-    if start < 0 or start > rows_inout.item.shape[0] - count:  # a launch that has lost work
-        if warp_lane() == 0:
-            rows_inout.count[p] = 0
-        return
     swapped = batch.poses[p].swapped
+    if start < 0 or start > room - count:  # a launch that has lost work
+        first = wp.int32(SLOT_ROOM)
     while first < SLOT_ROOM:
         k = SLOT_ROOM * p + wp.min(first + warp_lane(), SLOT_ROOM - 1)
         kept = first + warp_lane() < SLOT_ROOM
@@ -220,7 +218,11 @@ def list_witness_kernel(batch: PairBatch, slots: Slots, hits: Hits, rows_inout: 
                 item = wp.vec3i(p | NEAR_BIT, row[1 + swapped], row[2 - swapped])
             rows_inout.item[start + place] = item
         first += warp_size()
-    k = end + warp_lane()
-    while k < count:
-        rows_inout.item[start + k] = wp.vec3i(-1, 0, 0)
-        k += warp_size()
+    if start >= 0:
+        k = end + warp_lane()
+        while k < wp.min(count, room - start):
+            rows_inout.item[start + k] = wp.vec3i(-1, 0, 0)
+            k += warp_size()
+    warp_sync()
+    if warp_lane() == 0 and (start < 0 or start > room - count):
+        rows_inout.count[p] = 0

@@ -29,7 +29,7 @@ def keep_nearest_kernel(
     w = wp.tid()
     if w >= wp.min(hits.witness_total[0], rows.item.shape[0]):
         return
-    if witnesses_inout.unsure[w] == 0:
+    if witnesses_inout.nearest_only[w] == 0:
         return
     p = rows.item[w][0] & PAIR_MASK
     pose = batch.poses[p]

@@ -30,7 +30,7 @@ WITHIN = wp.constant(-1)
 # EXACT, and face pairs that are apart by less than a gap are listed too.
 GAP = wp.constant(-2)
 # GAP, but all face pairs that are apart and may be nearer than a gap are listed as such, whether they are or not.
-LISTED = wp.constant(-3)
+NEAR_LISTED = wp.constant(-3)
 
 # On the pair of a face pair in `Hits.face`: it is apart.
 NEAR_BIT = wp.constant(1 << 30)

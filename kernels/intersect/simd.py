@@ -25,7 +25,7 @@ from warp_abtree.kernels.intersect.descent import (
 )
 from warp_abtree.kernels.intersect.face_pairs import (
     GAP,
-    LISTED,
+    NEAR_LISTED,
     OUTPUT_ANY,
     OUTPUT_FACES,
     WITHIN,
@@ -238,8 +238,8 @@ def test_gap_pairs(
 
 @functools.cache
 def thread_traversal(mode: int):
-    """Return the kernel whose threads share the object pairs, at a precision, WITHIN, GAP or LISTED."""
-    with_gap = mode in (int(GAP), int(LISTED))
+    """Return the kernel whose threads share the object pairs, at a precision, WITHIN, GAP or NEAR_LISTED."""
+    with_gap = mode in (int(GAP), int(NEAR_LISTED))
     start_pairs = pairs_starter(with_gap or mode == int(WITHIN))
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)

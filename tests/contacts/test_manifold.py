@@ -213,15 +213,32 @@ def test_points_are_as_many_as_asked_for(device, most):
     seen = (normals @ np.asarray(ball.vertices).T).max(0).min()  # cosine of the emptiest cap
     # What is pushed anywhere is held within that angle; and 24 do what no 8 can, 48 degrees.
     assert seen > {8: -0.11, 24: 0.67}[most]
-    assert (1 - normals @ normals.T + 2 * np.eye(len(normals))).min() > 0.01
+    places = np.hstack([points["point"], normals])
+    away = np.linalg.norm(places[:, None] - places, axis=2)
+    assert (away + 2 * np.eye(len(places))).min() > 0.05
+
+
+def turn_twists(turns, n, wrench):
+    """Return turns about lines at the rim of wrenches across a normal, in 32 directions, (6, 32)."""
+    axis = np.abs(n).argmin()
+    u = np.cross(n, np.eye(3)[axis])
+    u /= np.linalg.norm(u)
+    directions = turns[0][:, None] * u + turns[1][:, None] * np.cross(n, u)
+    angular = np.cross(n, directions)
+    reach = 0.95 * (-wrench[:, 3:] @ angular.T).max(0)
+    twists = np.hstack([reach[:, None] * n, angular])
+    return (twists / np.linalg.norm(twists, axis=1)[:, None]).T
 
 
 def choose_plainly(x, normal, depth, gap, most):
     """Return which candidates stand for a pair, by the twists that go deepest past those before, an oracle."""
-    twists = make_twists().reshape(6, -1).astype(float)
     low, high = x.min(0), x.max(0)
     size, deepest = np.linalg.norm(high - low) / 2, depth.max()
     wrench = np.hstack([normal, np.cross((x - (low + high) / 2) / size, normal)])
+    against = normal[(normal @ normal[depth.argmax()]).argmin()]
+    twists = make_twists().reshape(6, -1).astype(float)
+    turns = [turn_twists(twists[:, 192:224], n, wrench) for n in (normal[depth.argmax()], against)]
+    twists = np.hstack([twists[:, :192], *turns])
     separation, rate = max(deepest, 0.0) - depth, wrench @ twists
     limit, taken = 2 * (gap + max(deepest, 0.0)) + size / 256, []
     stop = np.full(twists.shape[1], limit)
@@ -246,10 +263,11 @@ def test_points_are_those_of_a_plain_choice(device, gap, most):
         shifts = (0, 0, 0), (0.3, 0.1, height)
         placed = [(torus, (*shift, *about((1, 2, k), 0.5 + j + k))) for j, shift in enumerate(shifts)]
         query, result = ask_points(device, *placed, gap=gap, points=most)
-        count, curves, along = query.start.numpy()[1], query.curves, [0.6134, 0.5327, 0.5831]
-        depth = curves.depth.numpy()[:count]
+        witnesses, along = query.witnesses, [0.6134, 0.5327, 0.5831]
+        count = query.hits.witness_total.numpy()[0]
+        depth = witnesses.depth.numpy()[:count]
         i = np.nonzero(depth >= -(gap or 0.0))
-        x, normal = curves.point.numpy()[:count][i], curves.normal.numpy()[:count][i[0]]
+        x, normal = witnesses.point.numpy()[:count][i], witnesses.normal.numpy()[:count][i[0]]
         turn = quaternion_matrix(placed[0][1][3:])
         taken = choose_plainly(x @ turn, normal @ turn, depth[i], gap or 0.0, most)
         expected = x[taken][np.argsort(x[taken] @ (turn @ along))]

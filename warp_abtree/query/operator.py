@@ -55,7 +55,6 @@ class Operator(DeviceMemory):
         pair_batch: `PairBatch` of the pairs queried.
         hits: Device arrays of the last launch, `kernels.intersect.face_pairs.Hits`.
         counts: Counters of `hits`, device int64; rows: count, then `COUNTERS`.
-        lists_apart: Whether face pairs that are apart and may be near are listed, on every device.
         traversal: `Traversal` of the hits, which stages share.
         lists_hits: Whether a result has the hits as rows, which are sorted while the host still launches.
         given: Pairs on the host, int32 (p, 2), unless the broad phase finds them.
@@ -67,7 +66,7 @@ class Operator(DeviceMemory):
     broad_phase: Any = None
     near: Any = None
     hits: Any
-    lists_apart = False
+    lists_apart = False  # whether face pairs that are apart and may be near are listed, on every device
     counts: wp.array
     traversal: Any
     lists_hits = False

@@ -18,6 +18,7 @@ struct Float32 {
     static CUDA_CALLABLE float dot(const Point& u, const Point& v) { return fuse(u.x, v.x, fuse(u.y, v.y, u.z * v.z)); }
     static CUDA_CALLABLE float root(float v) { return sqrtf(v); }
     static CUDA_CALLABLE float first(float v) { return v; }
+    static CUDA_CALLABLE float pick(const float* from, int at) { return from[at]; }
     static CUDA_CALLABLE Point choose(bool which, const Point& a, const Point& b) { return which ? a : b; }
 };
 #else
@@ -43,8 +44,16 @@ struct Float32 {
     static lanes every(float v) { return lanes{v, v, v, v, v, v, v, v, v, v, v, v, v, v, v, v}; }
     static lanes root(const lanes& v) { return __builtin_elementwise_sqrt(v); }
     static float first(const lanes& v) { return v[0]; }
+    static float pick(const float* from, int at) { return from[at]; }
+    static lanes pick(const float* from, const bits& at) {
+        lanes x;
+        for (int k = 0; k < 16; ++k)
+            x[k] = from[at[k]];
+        return x;
+    }
     static lanes absolute(const lanes& v) { return __builtin_elementwise_abs(v); }
     static lanes fuse(const lanes& a, const lanes& b, const lanes& c) { return __builtin_elementwise_fma(a, b, c); }
+    static float fuse(float a, float b, float c) { return __builtin_fmaf(a, b, c); }
     static lanes sum_sizes(const Point& v) { return (absolute(v.x) + absolute(v.y)) + absolute(v.z); }
     static Point minus(const Point& a, const Point& b) { return Point{a.x - b.x, a.y - b.y, a.z - b.z}; }
     static Point cross(const Point& u, const Point& v) {

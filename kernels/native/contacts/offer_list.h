@@ -1,7 +1,7 @@
 // Offers of listed face pairs to the slots of their object pairs on the CPU, 16 at a time.
 #pragma once
 #include "builtin.h"
-#include "contacts/slots.cuh"
+#include "contacts/near_offer.cuh"
 #include "distance/corners32.h"
 
 template <class ModelPool, class StatePool, class PairPose>

@@ -5,14 +5,6 @@
 #include "base/sizes.h"
 #include "contacts/groups.cuh"
 
-inline CUDA_CALLABLE float fuse_numbers(float a, float b, float c) {
-#if defined(__CUDA_ARCH__)
-    return __fmaf_rn(a, b, c);
-#else
-    return __builtin_fmaf(a, b, c);
-#endif
-}
-
 struct TwistChoice {
     typedef Float32 F;
     typedef F::lanes lanes;
@@ -122,7 +114,7 @@ CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec_t<4, wp::float32>> 
     const wp::vec_t<4, float>& own = wrenches.data[2 * nearest_at];
     for (int k = first + group_lane(); k < end; k += group_size()) {
         const wp::vec_t<4, float>& n = wrenches.data[2 * k];
-        const float other = -fuse_numbers(own[0], n[0], fuse_numbers(own[1], n[1], own[2] * n[2]));
+        const float other = -Float32::fuse(own[0], n[0], Float32::fuse(own[1], n[1], own[2] * n[2]));
         if (other > against) {
             against = other;
             against_at = k;

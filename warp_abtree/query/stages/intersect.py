@@ -65,7 +65,7 @@ class IntersectStage(HitStage):
         self._is_exact, self._with_gap, self._reads = precision == "exact", with_gap, reads and output == "faces"
         self._mode = int(face_pairs.GAP if with_gap else PRECISIONS[precision])
         if reduced and with_gap:
-            self._mode = int(face_pairs.LISTED)
+            self._mode = int(face_pairs.NEAR_LISTED)
         self._output = int(OUTPUTS[output])
 
     def attach(self, operator: Operator):

@@ -113,7 +113,7 @@ class PointStage(Stage):
         return [
             *fields(self.curves, rooms.hits, parent=wp.int32, loop=wp.int32, loop_normal=wp.vec3d, has_area=wp.int32),
             *fields(witnesses, (room, CANDIDATES), point=wp.vec3d, depth=wp.float64),
-            *fields(witnesses, room, normal=wp.vec3d, unsure=wp.int32),
+            *fields(witnesses, room, normal=wp.vec3d, nearest_only=wp.int32),
             Array(witnesses, "wrench", wp.vec4, 2 * CANDIDATES * room),
             *(near if self._with_gap else []),
             Array(self.manifolds, "count", wp.int32, rooms.pairs, 0),
@@ -213,7 +213,7 @@ class ManifoldQuery(Operator):
         slots: Any = next(stage for stage in stages if isinstance(stage, SlotStage))
         found = PointStage(slots, contacts, gap is not None, self.point_max)
         self.contacts, self.manifolds, self.curves = contacts.contacts, found.manifolds, found.curves
-        self.witnesses = found.witnesses
+        self.witnesses, self.witness_rows, self.near_contacts = found.witnesses, slots.rows, found.near
         warn_of_winding(scene)
         super().__init__(scene, [*stages, found], pairs, capacity, "faces", sort_pairs=True)
 

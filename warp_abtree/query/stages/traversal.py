@@ -31,7 +31,7 @@ WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 
 def find_passes(mode: int) -> list:
     """Return the passes over the traversal's lists: kernels, their warps a multiprocessor, threads of a block."""
-    if mode not in (int(EXACT), int(face_pairs.GAP), int(face_pairs.LISTED)):
+    if mode not in (int(EXACT), int(face_pairs.GAP), int(face_pairs.NEAR_LISTED)):
         return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS)]
     return [
         (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS),
@@ -42,14 +42,14 @@ def find_passes(mode: int) -> list:
 
 def mode_of_warps(mode: int) -> int:
     """Return the mode of a traversal by warps, which list what is apart in any case."""
-    return int(face_pairs.GAP) if mode == int(face_pairs.LISTED) else mode
+    return int(face_pairs.GAP) if mode == int(face_pairs.NEAR_LISTED) else mode
 
 
 def traversal_kernels(device, regime, mode: int, is_any: bool) -> list:
     """Return the kernels of a traversal with block sizes, those first that take longest to compile."""
     if not regime.uses_warps(device):
         return [(simd.thread_traversal(mode), WARP_SIZE)]
-    with_distances = mode in (int(face_pairs.WITHIN), int(face_pairs.GAP), int(face_pairs.LISTED))
+    with_distances = mode in (int(face_pairs.WITHIN), int(face_pairs.GAP), int(face_pairs.NEAR_LISTED))
     passes = [] if mode == int(face_pairs.WITHIN) else reversed(find_passes(mode))
     return [
         (dual_tree.warp_traversal(mode_of_warps(mode), is_any), WARP_SIZE),

@@ -1,0 +1,133 @@
+// Offers of faces that are apart to slots: of one pair in each thread of a GPU, of 16 on the CPU.
+#pragma once
+#include "builtin.h"
+#include "contacts/slots.cuh"
+#include "distance/faces32.h"
+
+// Faces look at one another whose normals have no greater product: within 60 degrees.
+constexpr float LOOKS_AT = -0.5f;
+// Farther than any point.
+constexpr float FAR_AWAY = 0x1p60f;
+
+struct NearOffer {
+    typedef NearestFaces N;
+    typedef Float32 F;
+    typedef F::lanes lanes;
+    typedef F::bits bits;
+    typedef F::Point Point;
+#if defined(__CUDA_ARCH__)
+    typedef int integers;
+#else
+    typedef bits integers;
+#endif
+    struct Scores : SlotScores<lanes, bits, integers> {
+        typedef SlotScores<lanes, bits, integers> Base;
+        bits inside;
+        CUDA_CALLABLE Scores(const Vector& n, const float* directions) : Base(n, directions) {}
+    };
+
+    static CUDA_CALLABLE Point unit_normal(const Point (&c)[3]) {
+        const Point n = N::cross_exactly(F::minus(c[1], c[0]), F::minus(c[2], c[0]));
+        const lanes s = N::invert(F::root(F::dot(n, n)));
+        return Point{n.x * s, n.y * s, n.z * s};
+    }
+    // What joins two faces: from a point of A to the nearest of B; corners over a face, and how far in front of it.
+    struct Joined {
+        Point normal_a, normal_b, at, way, corner[6];
+        lanes square, height[6];
+        int count;
+        CUDA_CALLABLE void offer(const Point& v, const Point& point) {
+            const lanes found = F::dot(v, v);
+            const auto closer = found < square;
+            square = closer ? found : square;
+            way = F::choose(closer, v, way);
+            at = F::choose(closer, point, at);
+        }
+        CUDA_CALLABLE void note(const Point& v, const Point& point, const Point& normal) {
+            corner[count] = point;
+            height[count++] = v.x < FAR_AWAY ? F::dot(v, normal) : lanes{} + FAR_AWAY;
+        }
+        CUDA_CALLABLE void offer_edges(const Point& v, const Point& p, const lanes& s, const Point& e) {
+            offer(v, N::add(p, s, e));
+        }
+        CUDA_CALLABLE void offer_corner_of_b(const Point& v, const Point& point) {
+            note(v, point, normal_a);
+            offer(v, F::minus(point, v));
+        }
+        CUDA_CALLABLE void offer_corner_of_a(const Point& v, const Point& point) {
+            note(v, point, normal_b);
+            offer(Point{-v.x, -v.y, -v.z}, point);
+        }
+    };
+    static CUDA_CALLABLE Scores::Vector vector_of(const Point& p) { return {p.x, p.y, p.z}; }
+    static CUDA_CALLABLE Scores rate(const N::Corners& c, float gap, float weight, const float* directions) {
+        const lanes zero = {};
+        Joined joined;
+        joined.normal_a = unit_normal(c.a);
+        joined.normal_b = unit_normal(c.b);
+        joined.square = zero + 0x1.fffffep127f;
+        joined.at = joined.way = Point{zero, zero, zero};
+        joined.count = 0;
+        const lanes size = N::visit(c, joined), distance = F::root(joined.square);
+        const lanes ahead_a = F::dot(joined.way, joined.normal_a), ahead_b = -F::dot(joined.way, joined.normal_b);
+        const bits facing = F::dot(joined.normal_a, joined.normal_b) <= LOOKS_AT;
+        // Along a normal, or so near that normals tell the direction.
+        const lanes most = N::most(F::absolute(ahead_a), F::absolute(ahead_b));
+        const bits touches = distance <= size * 0x1p-20f, column = facing & (touches | (most >= distance * 0.99f));
+        const bits along = column | touches, inside = column & (distance > size * 0x1p-20f) & (ahead_a < 0.0f) & (ahead_b < 0.0f);
+        const lanes separation = inside ? -distance : distance, least = distance * 0x1p-6f;
+        // What lies deeper inside than its distance is not measured by it (`near_points`).
+        lanes lowest = zero;
+        for (int k = 0; k < 6; ++k)
+            lowest = joined.height[k] < lowest ? joined.height[k] : lowest;
+        const bits fits = (separation >= 0.0f) | (-lowest <= distance * (1.0f + 0x1p-10f) + size * 0x1p-20f);
+        const bits counts = (distance <= gap) & fits & (along | ((ahead_a > least) & (ahead_b > least)));
+        const Point n = F::choose(along, F::minus(joined.normal_a, joined.normal_b), joined.way);
+        Scores scores(vector_of(n), directions);
+        scores.inside = inside;
+        // What touches beside a column, perhaps looking away, goes behind all that is in one.
+        const lanes rank = column ? separation : separation + (along ? zero + gap : zero);
+        scores.offer(weight, vector_of(N::add(joined.at, zero + 0.5f, joined.way)), rank, counts);
+        for (int k = 0; k < 6; ++k) {
+            const bits near = (joined.height[k] <= gap) & (joined.height[k] >= -gap);
+            scores.offer(weight, vector_of(joined.corner[k]), joined.height[k], counts & column & (separation >= 0.0f) & near);
+        }
+        return scores;
+    }
+    // Puts the scores of a lane into the slots of its object pair: of what is inside the deepest alone.
+    static CUDA_CALLABLE void put(const Scores& scores, int lane, int place, wp::int64* slots,
+                                  const wp::vec_t<3, wp::int32>* list) {
+#if defined(__CUDA_ARCH__)
+        const int bin = scores.bin / 9;
+        const bool inside = scores.inside;
+#else
+        const int bin = scores.bin[lane] / 9;
+        const bool inside = scores.inside[lane] != 0;
+#endif
+        wp::int64* const slot = slots + SLOTS_A_BIN * bin + (inside ? 2 * SCORES : SCORES);
+        for (int k = 0; k < (inside ? 1 : SCORES); ++k) {
+#if defined(__CUDA_ARCH__)
+            const float score = scores.score[k];
+#else
+            const float score = scores.score[k][lane];
+#endif
+            if (score > NO_SCORE)
+                put_into_slot(slot + k, make_slot_key(score, place), list);
+        }
+    }
+};
+
+template <class Corners>
+CUDA_CALLABLE void offer_faces(const Corners& a, const Corners& b, wp::float32 gap, wp::float32 weight,
+                               wp::array_t<wp::float32> directions, wp::int32 place, wp::int32 pair,
+                               wp::array_t<wp::vec_t<3, wp::int32>> list, wp::array_t<wp::int64> slots) {
+    typedef NearOffer O;
+    const O::lanes zero = {};
+    O::N::Corners c;
+    for (int k = 0; k < 3; ++k) {
+        c.a[k] = O::Point{zero + a.data[k][0], zero + a.data[k][1], zero + a.data[k][2]};
+        c.b[k] = O::Point{zero + b.data[k][0], zero + b.data[k][1], zero + b.data[k][2]};
+    }
+    const O::Scores scores = O::rate(c, gap, weight, directions.data);
+    O::put(scores, 0, place, slots.data + (wp::int64)pair * SLOT_ROOM, list.data);
+}
