@@ -25,7 +25,7 @@ QUICK = {"poses": 2, "worlds": {"cuda": 2, "cpu": 2}, "repeats": 1}
 LODS = {"all faces": None, "10 um": 1e-5, "30 um": 3e-5}  # tolerance [m]
 GAP = 1e-4  # of the pair [m]
 ASKED = (16, 32)
-SPARE = 1.1  # room for near faces over those of as many worlds like the judged ones
+SPARE = 1.1  # room for crossing faces over those of as many worlds like the judged ones
 
 
 def run(device, quick=False, count=None, models=None):
@@ -66,8 +66,8 @@ def points_of(found, p) -> Contacts:
 
 def judge(near, found) -> dict:
     """Return the columns of penetration [um]; raise a RuntimeError where contacts and points are of other faces."""
-    if not (np.array_equal(near.count, found.count) and np.array_equal(near.any, found.any)):
-        raise RuntimeError("contacts and contact points have other near faces")
+    if not np.array_equal(near.any, found.any):
+        raise RuntimeError("contacts and contact points differ about what intersects")
     allowed = []
     for p in range(len(near.pairs)):
         contacts = near_contacts(near.contacts[near.contacts["pair"] == p])
@@ -92,7 +92,7 @@ def scene_of_worlds(device, models, lods, matrices):
 def time_worlds(device, models, lods, matrices, asked, found, repeats) -> dict:
     """Return the columns of times; raise a RuntimeError where worlds have other points than the poses judged."""
     scene, pairs = scene_of_worlds(device, models, lods, matrices)
-    capacity = ab.Buffers(hits=int(SPARE * found.count.mean() * len(pairs)))
+    capacity = ab.Buffers(hits=1024 + int(SPARE * found.count.mean() * len(pairs)))
     query = ab.ManifoldQuery(scene, pairs, capacity, gap=GAP, points=asked)
     result = query.run()
     for p in range(min(len(pairs), len(found.pairs))):

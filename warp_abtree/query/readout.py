@@ -10,6 +10,7 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.io import results as kernels
+from warp_abtree.query.request import APART_FOR_UNCERTAIN
 from warp_abtree.query.result import COUNTERS, Found, Result, Totals
 from warp_abtree.query.sorting import HitSort, first_sort, sort_rows
 from warp_abtree.query.staging import Staging, first_rows, view_memory
@@ -25,6 +26,12 @@ def readout_kernels(device, output: str) -> list:
     if not current_regime().packs(device):
         return []
     return [(kernels.pack_pair_kernel, kernels.BLOCK_DIM), *(first_sort(device) if output == "faces" else [])]
+
+
+def waiting_demand(operator: Any, apart: int, uncertain: int) -> int:
+    """Return the room that an operator's lists need for face pairs that are apart, and that are uncertain."""
+    listed = uncertain if operator.uses_warps() else 0
+    return max(apart, listed * (APART_FOR_UNCERTAIN if operator.lists_apart else 1))
 
 
 class HostViews:
@@ -119,8 +126,8 @@ class Readout:
             total = int(views.counts[0].sum())
         if operator.rooms.uncertain:
             apart, witnesses = (self._read_count(count) for count in (hits.apart_total, hits.witness_total))
-            waiting = int(views.counts[FLOAT64_ROW].sum()) if operator.uses_warps() else 0
-            total, uncertain = max(total, witnesses), max(apart, waiting)
+            waiting = int(views.counts[FLOAT64_ROW].sum())
+            total, uncertain = max(total, witnesses), waiting_demand(operator, apart, waiting)
         return Totals(operator.guard.outcome(), self._pair_count(int(views.pair_count[0])), total, uncertain)
 
     @staticmethod
@@ -138,7 +145,8 @@ class Readout:
         launched, found, total, uncertain, apart, witnesses = words[:HEADER].tolist()
         total = max(total, witnesses)
         listed, waits = self.operator.output == "faces", self.operator.rooms.uncertain
-        return Totals(launched, self._pair_count(found), total if listed else 0, max(uncertain, apart) if waits else 0)
+        demand = waiting_demand(self.operator, apart, uncertain) if waits else 0
+        return Totals(launched, self._pair_count(found), total if listed else 0, demand)
 
     def read_pairs(self, device: bool) -> Found:
         """Read demands, and what there is an entry a pair of. Waits for the device."""

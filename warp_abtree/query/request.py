@@ -30,6 +30,10 @@ class CapacityError(RuntimeError):
     """A buffer was too small and work was lost; the message names the demand."""
 
 
+# Where all face pairs that may be near are listed, those that are uncertain have this part of the room.
+APART_FOR_UNCERTAIN = 4
+
+
 @dataclass(frozen=True)
 class Buffers:
     """Room of a query's lists; None is a guess. `run()` makes more room, `launch()` cannot.

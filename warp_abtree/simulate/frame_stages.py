@@ -14,6 +14,7 @@ from warp_abtree.kernels.lod.ladder import WARP
 from warp_abtree.kernels.update import levels as level_kernels
 from warp_abtree.kernels.update import work_lists
 from warp_abtree.lod.controllers import Controller
+from warp_abtree.query.readout import waiting_demand
 from warp_abtree.query.stages.contacts import ContactQuery
 from warp_abtree.query.stages.intersect import Query
 from warp_abtree.scene.scene import Scene
@@ -205,10 +206,10 @@ class FrameStages:
 
     def has_room(self, found: dict) -> bool:
         """Return whether all buffers had room for what a frame has found, of which this is the summary."""
-        query, room = self.query, len(self.query.hits.uncertain)
+        query, room = self.query, self.query.rooms.uncertain
         return (
             found["launched"] >= 0
             and 0 <= found["pairs"] <= len(query.pairs)
             and (query.output != "faces" or max(found["hits"], found["witnesses"]) <= len(query.hits.face))
-            and (not room or max(found["uncertain"], found["apart"]) <= room)
+            and (not room or waiting_demand(query, found["apart"], found["uncertain"]) <= room)
         )

@@ -6,7 +6,7 @@ import warp as wp
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.intersect import face_pairs, near_faces
 from warp_abtree.query.operator import Operator
-from warp_abtree.query.request import OUTPUTS, PRECISIONS, check_gap, check_request
+from warp_abtree.query.request import APART_FOR_UNCERTAIN, OUTPUTS, PRECISIONS, check_gap, check_request
 from warp_abtree.query.result import COUNTERS, Found
 from warp_abtree.query.stage import Array, PairDistance, Rooms, Stage
 from warp_abtree.query.stages.inside import InsideStage
@@ -86,6 +86,8 @@ class IntersectStage(HitStage):
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return the arrays of hits, and the lists of face pairs that wait."""
         waiting = rooms.uncertain if self.operator.uses_warps() else 0
+        if self._mode == int(face_pairs.NEAR_LISTED):
+            waiting = -(-waiting // APART_FOR_UNCERTAIN)
         lists = {"face": rooms.hits, "uncertain": waiting, "inexact": waiting if self._is_exact else 0}
         if self._with_gap:
             lists["apart"] = rooms.uncertain
