@@ -8,7 +8,7 @@ from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.contacts.contact import Contacts
 from warp_abtree.kernels.contacts.slots import Slots, WitnessRows, offer_point
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
-from warp_abtree.kernels.triangle.corners import load_corners
+from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair
 from warp_abtree.kernels.triangle.distance import largest_coordinate
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
@@ -25,9 +25,10 @@ LIKENESS = wp.constant(wp.float64(0.5))
 COLUMN_SLACK = wp.constant(wp.float64(2.0**-36))
 # Part of the size of faces that depths in a column err by.
 COLUMN_ROUNDING = wp.constant(wp.float64(2.0**-46))
-CLIPPED_CORNERS = wp.constant(8)
 # Candidates of a contact: a triangle within the column of another has so many corners at most.
 COLUMN_CORNERS = wp.constant(6)
+# Places where there may be one: ends of three edges, and three piercing edges of the column.
+POSSIBLE_CORNERS = wp.constant(9)
 # Depths of candidates that there are not: the middle of the contact serves where all are so, or not even that.
 NO_DEPTH, NO_POINT = wp.constant(wp.float64(-wp.inf)), wp.constant(wp.float64(wp.nan))
 NO_DEPTH_SEPARATION = wp.constant(wp.float32(2.0**60))  # more than any, in offers to slots
@@ -64,104 +65,177 @@ class Manifolds:
     depth: wp.array2d(dtype=wp.float64)  # [world units] along the normal, negative if apart, shape [pair, points]
 
 
-@wp.func
-def clip_column(
-    corner: wp.array(dtype=wp.vec3d), face: wp.int32, cut: wp.int32, n: wp.vec3d, polygon: wp.array(dtype=wp.vec3d)
-):
-    """Clip the triangle at cut to the column of the triangle at face along n; return the number of polygon corners."""
-    zero = wp.float64(0.0)
-    clipped = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.vec3d)
-    count = wp.int32(3)
-    for k in range(3):
-        polygon[k] = corner[cut + k]
-    for k in range(3):
-        u = corner[face + k]
-        edge = corner[face + (k + 1) % 3] - u
-        across = corner[face + (k + 2) % 3] - u
-        inward = unit_vector(wp.cross(edge, n))
-        if wp.dot(inward, across) < zero:
-            inward = -inward
-        slack = COLUMN_SLACK * (measure_length(edge) + measure_length(across))
-        kept = wp.int32(0)
-        i = wp.int32(0)
-        while i < count:
-            p = polygon[i]
-            q = polygon[(i + 1) % count]
-            at_p = wp.dot(inward, p - u) + slack
-            at_q = wp.dot(inward, q - u) + slack
-            if at_p >= zero:
-                clipped[kept] = p
-                kept += 1
-            if (at_p < zero) != (at_q < zero):
-                clipped[kept] = p + (q - p) * (at_p / (at_p - at_q))
-                kept += 1
-            i += 1
-        count = kept
-        i = wp.int32(0)
-        while i < count:
-            polygon[i] = clipped[i]
-            i += 1
-    return count
+@wp.struct
+class FacePair:
+    """Corners of the faces of a pair's first and second object, A's frame."""
+
+    a0: wp.vec3d
+    a1: wp.vec3d
+    a2: wp.vec3d
+    b0: wp.vec3d
+    b1: wp.vec3d
+    b2: wp.vec3d
 
 
 @wp.func
-def column_slack(corner: wp.array(dtype=wp.vec3d)):
+def load_pair(trees: Trees, pose: PairPose, faces: wp.vec3i):
+    """Return the faces of a contact, of which `faces` names the pair, and those of the first and the second object."""
+    a = load_corner_ids(trees.states, pose.corner_a + faces[1 + pose.swapped])
+    b = load_corner_ids(trees.states, pose.corner_b + faces[2 - pose.swapped])
+    a0, a1, a2, b0, b1, b2 = load_face_pair(trees.models, pose, a, b)
+    pair, back = FacePair(), pose.swapped != 0
+    pair.a0 = wp.where(back, b0, a0)
+    pair.a1 = wp.where(back, b1, a1)
+    pair.a2 = wp.where(back, b2, a2)
+    pair.b0 = wp.where(back, a0, b0)
+    pair.b1 = wp.where(back, a1, b1)
+    pair.b2 = wp.where(back, a2, b2)
+    return pair
+
+
+@wp.func
+def column_slack(pair: FacePair):
     """Return what depths in a column err by at most: a part of the size of both faces."""
-    size = wp.float64(0.0)
-    for k in range(5):
-        size = wp.max(size, largest_coordinate(corner[k + 1] - corner[0]))
-    return COLUMN_ROUNDING * size
+    size = wp.max(largest_coordinate(pair.a1 - pair.a0), largest_coordinate(pair.a2 - pair.a0))
+    size = wp.max(size, wp.max(largest_coordinate(pair.b0 - pair.a0), largest_coordinate(pair.b1 - pair.a0)))
+    return COLUMN_ROUNDING * wp.max(size, largest_coordinate(pair.b2 - pair.a0))
 
 
 @wp.struct
 class Column:
-    """The column of one face along a normal, with what lies of the other within it."""
+    """The column of one face along a normal, and the face that it cuts.
+
+    The corners of what lies of that within it are the ends of its edges, clipped, and where the column's edges pierce
+    it: nine at most, each of them once.
+    """
 
     normal: wp.vec3d  # unit, from the pair's first object to its second
     depth: wp.float64  # how deep the deepest corner is behind the face, or NO_DEPTH
-    count: wp.int32  # corners of the polygon
+    plane: wp.vec3d  # the face's normal over its cosine with the column's
+    u0: wp.vec3d  # corners of the face
+    u1: wp.vec3d  # the second
+    u2: wp.vec3d  # the third
+    v0: wp.vec3d  # corners of the other one
+    v1: wp.vec3d  # the second
+    v2: wp.vec3d  # the third
+    side0: wp.vec3d  # unit normals of the column's sides, inwards
+    side1: wp.vec3d  # the second
+    side2: wp.vec3d  # the third
+    slack: wp.vec3d  # by which each side is wider
 
 
 @wp.func
-def measure_column(
-    corner: wp.array(dtype=wp.vec3d),
-    n: wp.vec3d,
-    normal_a: wp.vec3d,
-    normal_b: wp.vec3d,
-    first: wp.int32,
-    least: wp.float64,
-    point: wp.array(dtype=wp.vec3d),
-    depth: wp.array(dtype=wp.float64),
-):
-    """Find the part of one face within the column of the other along n: its corners, and their depths along n.
+def make_side(n: wp.vec3d, u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
+    """Return the inward normal of the side of a column over the edge from u to v, w the third corner, and its slack."""
+    edge, across = v - u, w - u
+    inward = unit_vector(wp.cross(edge, n))
+    if wp.dot(inward, across) < wp.float64(0.0):
+        inward = -inward
+    return inward, COLUMN_SLACK * (measure_length(edge) + measure_length(across))
+
+
+@wp.func
+def height_over(side: wp.vec3d, u: wp.vec3d, slack: wp.float64, p: wp.vec3d):
+    return wp.dot(side, p - u) + slack
+
+
+@wp.func
+def clip_range(range: wp.vec2d, at_p: wp.float64, at_q: wp.float64):
+    """Return the part of a range of an edge's parameter where a linear function is not negative; [2, 1] for none."""
+    zero = wp.float64(0.0)
+    if at_p < zero and at_q < zero:
+        return wp.vec2d(wp.float64(2.0), wp.float64(1.0))
+    if at_p < zero:
+        range[0] = wp.max(range[0], at_p / (at_p - at_q))
+    if at_q < zero:
+        range[1] = wp.min(range[1], at_p / (at_p - at_q))
+    return range
+
+
+@wp.func
+def clip_edge(column: Column, p: wp.vec3d, q: wp.vec3d):
+    """Return between which parameters an edge from p to q lies within a column, the first more where it does not."""
+    range = wp.vec2d(wp.float64(0.0), wp.float64(1.0))
+    s = column.slack
+    range = clip_range(
+        range, height_over(column.side0, column.u0, s[0], p), height_over(column.side0, column.u0, s[0], q)
+    )
+    range = clip_range(
+        range, height_over(column.side1, column.u1, s[1], p), height_over(column.side1, column.u1, s[1], q)
+    )
+    return clip_range(
+        range, height_over(column.side2, column.u2, s[2], p), height_over(column.side2, column.u2, s[2], q)
+    )
+
+
+@wp.func
+def pierce_cut(column: Column, u: wp.vec3d):
+    """Return where the edge of a column at a corner of its face pierces the other face, and whether it does."""
+    zero = wp.float64(0.0)
+    m = wp.cross(column.v1 - column.v0, column.v2 - column.v0)
+    along = wp.dot(column.normal, m)
+    if along == zero:
+        return u, False
+    p = u + column.normal * (wp.dot(column.v0 - u, m) / along)
+    inside = wp.dot(wp.cross(column.v1 - column.v0, p - column.v0), m) > zero
+    inside = inside and wp.dot(wp.cross(column.v2 - column.v1, p - column.v1), m) > zero
+    return p, inside and wp.dot(wp.cross(column.v0 - column.v2, p - column.v2), m) > zero
+
+
+@wp.func
+def corner_of(column: Column, k: wp.int32):
+    """Return the k-th corner of what a column cuts, its depth, and whether there is one, k = 0 .. 8."""
+    zero, one = wp.float64(0.0), wp.float64(1.0)
+    point, exists = wp.vec3d(), False
+    if k < 6:
+        p = wp.where(k < 2, column.v0, wp.where(k < 4, column.v1, column.v2))
+        q = wp.where(k < 2, column.v1, wp.where(k < 4, column.v2, column.v0))
+        range = clip_edge(column, p, q)
+        # The end of an edge, where it is within, is the start of the next.
+        exists = range[0] <= range[1] and (k % 2 == 0 or (range[1] < one and range[0] < range[1]))
+        t = range[k % 2]
+        point = p
+        if t > zero:
+            point = p + (q - p) * t
+    else:
+        point, exists = pierce_cut(column, wp.where(k == 6, column.u0, wp.where(k == 7, column.u1, column.u2)))
+    return point, wp.dot(column.u0 - point, column.plane), exists
+
+
+@wp.func
+def measure_column(pair: FacePair, n: wp.vec3d, normal_a: wp.vec3d, normal_b: wp.vec3d, least: wp.float64):
+    """Return the column of one face along n, of that which looks more along it, and how deep the other is within it.
 
     Args:
         least: Depth from which on corners count: 0, or minus the gap.
-        corner: Corners of the pair's first object at places first .. first + 2, of its second at the others.
     """
     column = Column()
     column.normal = n
     column.depth = NO_DEPTH
-    facing_a = wp.dot(n, normal_a)
-    facing_b = -wp.dot(n, normal_b)
-    face = first
-    cut = 3 - first
-    plane = normal_a
-    facing = facing_a
-    if facing_b > facing_a:
-        face = 3 - first
-        cut = first
-        plane = normal_b
-        facing = facing_b
+    facing_a, facing_b = wp.dot(n, normal_a), -wp.dot(n, normal_b)
+    other, facing = facing_b > facing_a, wp.max(facing_a, facing_b)
     if facing < FACING:
         return column
-    column.count = clip_column(corner, face, cut, n, point)
-    i = wp.int32(0)
-    while i < column.count:
-        depth[i] = wp.dot(corner[face] - point[i], plane) / facing
-        if depth[i] >= least:
-            column.depth = wp.max(column.depth, depth[i])
-        i += 1
+    column.plane = wp.where(other, normal_b, normal_a) / facing
+    column.u0 = wp.where(other, pair.b0, pair.a0)
+    column.u1 = wp.where(other, pair.b1, pair.a1)
+    column.u2 = wp.where(other, pair.b2, pair.a2)
+    column.v0 = wp.where(other, pair.a0, pair.b0)
+    column.v1 = wp.where(other, pair.a1, pair.b1)
+    column.v2 = wp.where(other, pair.a2, pair.b2)
+    side0, s0 = make_side(n, column.u0, column.u1, column.u2)
+    side1, s1 = make_side(n, column.u1, column.u2, column.u0)
+    side2, s2 = make_side(n, column.u2, column.u0, column.u1)
+    column.side0 = side0
+    column.side1 = side1
+    column.side2 = side2
+    column.slack = wp.vec3d(s0, s1, s2)
+    k = wp.int32(0)
+    while k < POSSIBLE_CORNERS:
+        _, depth, exists = corner_of(column, k)
+        if exists and depth >= least:
+            column.depth = wp.max(column.depth, depth)
+        k += 1
     return column
 
 
@@ -172,18 +246,21 @@ def write_candidates(
     position: wp.vec3d,
     column: Column,
     least: wp.float64,
-    point: wp.array(dtype=wp.vec3d),
-    depth: wp.array(dtype=wp.float64),
     witnesses: Witnesses,
 ):
     """Write the candidates of a witness, posed to the world: the corners of a column that are deep enough."""
     witnesses.normal[w] = rotation * column.normal
-    for k in range(COLUMN_CORNERS):
-        witnesses.depth[w, k] = NO_POINT
-        if k < column.count and column.depth > NO_DEPTH:
-            if depth[k] >= least:
-                witnesses.depth[w, k] = depth[k]
-                witnesses.point[w, k] = pose_point(rotation, position, point[k])
+    place, k = wp.int32(0), wp.int32(0)
+    while k < POSSIBLE_CORNERS:
+        point, depth, exists = corner_of(column, k)
+        if exists and depth >= least and place < COLUMN_CORNERS:
+            witnesses.depth[w, place] = depth
+            witnesses.point[w, place] = pose_point(rotation, position, point)
+            place += 1
+        k += 1
+    while place < COLUMN_CORNERS:
+        witnesses.depth[w, place] = NO_POINT
+        place += 1
 
 
 @wp.func
@@ -197,11 +274,9 @@ def write_middle(w: wp.int32, i: wp.int32, n: wp.vec3d, contacts: Contacts, witn
 
 
 @wp.func
-def lies_in_front(n: wp.vec3d, face: wp.int32, corner: wp.array(dtype=wp.vec3d), slack: wp.float64):
-    """Return whether a face lies in front of the plane of that at corners face .. face + 2, whose normal is n."""
-    least = wp.float64(wp.inf)
-    for k in range(3):
-        least = wp.min(least, wp.dot(n, corner[3 - face + k] - corner[face]))
+def lies_in_front(n: wp.vec3d, u: wp.vec3d, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, slack: wp.float64):
+    """Return whether a face lies in front of the plane through u whose normal is n."""
+    least = wp.min(wp.dot(n, v0 - u), wp.min(wp.dot(n, v1 - u), wp.dot(n, v2 - u)))
     return least >= -slack and wp.dot(n, n) > wp.float64(0.0)
 
 
@@ -232,31 +307,22 @@ def load_crossing(i: wp.int32, batch: PairBatch, gap: wp.array(dtype=wp.float64)
 
 
 @wp.func
-def measure_crossing(
-    crossing: Crossing,
-    trees: Trees,
-    pose: PairPose,
-    contacts: Contacts,
-    curves: Curves,
-    point: wp.array(dtype=wp.vec3d),
-    depth: wp.array(dtype=wp.float64),
-):
-    """Find the normal and the candidate points of a contact of faces that cross, in A's frame.
+def measure_crossing(crossing: Crossing, trees: Trees, pose: PairPose, contacts: Contacts, curves: Curves):
+    """Return the column of a contact of faces that cross, in A's frame.
 
     Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least; of
     both faces' normals where neither is like it and one looks the other way. Where faces merely touch, the normal of a
     face that has the other in front serves, if it is like the loop's or that has no area, as rounding may have made it;
     edges beside one another have none then.
     """
-    corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    load_corners(trees, pose, crossing.faces[1 + pose.swapped], crossing.faces[2 - pose.swapped], corner)
+    pair = load_pair(trees, pose, crossing.faces)
     back = wp.transpose(trees.objects.rotation[crossing.a])
     normal_a = back * contacts.normal_a[crossing.i]
     normal_b = back * contacts.normal_b[crossing.i]
-    first, least, slack = 3 * pose.swapped, crossing.least, column_slack(corner)
+    least, slack = crossing.least, column_slack(pair)
     loop = back * curves.loop_normal[curves.loop[crossing.i]]
-    touches_a = lies_in_front(normal_a, first, corner, slack)
-    touches_b = lies_in_front(normal_b, 3 - first, corner, slack)
+    touches_a = lies_in_front(normal_a, pair.a0, pair.b0, pair.b1, pair.b2, slack)
+    touches_b = lies_in_front(normal_b, pair.b0, pair.a0, pair.a1, pair.a2, slack)
     if curves.has_area[curves.loop[crossing.i]] != 0:
         touches_a = touches_a and wp.dot(loop, normal_a) > LIKENESS
         touches_b = touches_b and -wp.dot(loop, normal_b) > LIKENESS
@@ -267,22 +333,20 @@ def measure_crossing(
         return none
     if touches_a or touches_b:
         n = wp.where(touches_a, normal_a, -normal_b)
-        return measure_column(corner, n, normal_a, normal_b, first, wp.min(least, -slack), point, depth)
-    best = measure_column(corner, loop, normal_a, normal_b, first, least, point, depth)
-    written = bool(True)
+        return measure_column(pair, n, normal_a, normal_b, wp.min(least, -slack))
+    best = measure_column(pair, loop, normal_a, normal_b, least)
     toward_a, toward_b = wp.dot(loop, normal_a), -wp.dot(loop, normal_b)
     toward = wp.max(toward_a, toward_b)
     # A loop that runs all round a part in another, as round a thread, has no one way out.
     contrary = FACING <= toward and toward <= LIKENESS and wp.min(toward_a, toward_b) < -FACING
-    for k in range(2):
+    k = wp.int32(0)
+    while k < 2:
         m = wp.where(k == 0, normal_a, -normal_b)
         if contrary or wp.dot(m, loop) > LIKENESS:
-            other = measure_column(corner, m, normal_a, normal_b, first, wp.min(least, -slack), point, depth)
-            written = other.depth >= -slack and (best.depth < -slack or other.depth <= best.depth + slack)
-            if written:
+            other = measure_column(pair, m, normal_a, normal_b, wp.min(least, -slack))
+            if other.depth >= -slack and (best.depth < -slack or other.depth <= best.depth + slack):
                 best = other
-    if not written and best.depth > NO_DEPTH:
-        best = measure_column(corner, best.normal, normal_a, normal_b, first, least, point, depth)
+        k += 1
     return best
 
 
@@ -312,9 +376,7 @@ def offer_crossing_kernel(
     crossing = load_crossing(i, batch, gap, faces[i], contacts)
     p = faces[i][0]
     pose = batch.poses[p]
-    point = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.vec3d)
-    depth = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.float64)
-    column = measure_crossing(crossing, trees, pose, contacts, curves, point, depth)
+    column = measure_crossing(crossing, trees, pose, contacts, curves)
     sense = wp.where(pose.swapped != 0, wp.float64(-1.0), wp.float64(1.0))
     n = wp.vec3(sense * column.normal)
     weight, directions = slots_inout.measures[p][1], slots_inout.directions
@@ -323,10 +385,13 @@ def offer_crossing_kernel(
         offer_point(n, wp.vec3(), NO_DEPTH_SEPARATION, weight, directions, i, p, hits.apart, slots_inout.key)
         return
     centre = trees.models.centre[trees.states.model[trees.objects.state[crossing.a]]]
-    for k in range(column.count):
-        if depth[k] >= crossing.least:
-            x, s = wp.vec3((point[k] - centre) * pose.scale), wp.float32(-depth[k] * pose.scale)
+    k = wp.int32(0)
+    while k < POSSIBLE_CORNERS:
+        point, depth, exists = corner_of(column, k)
+        if exists and depth >= crossing.least:
+            x, s = wp.vec3((point - centre) * pose.scale), wp.float32(-depth * pose.scale)
             offer_point(n, x, s, weight, directions, i, p, hits.apart, slots_inout.key)
+        k += 1
 
 
 @wp.kernel
@@ -352,11 +417,9 @@ def find_crossing_kernel(
     if item[0] < 0 or item[0] >= NEAR_BIT:
         return
     crossing = load_crossing(item[1], batch, gap, faces[item[1]], contacts)
-    point = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.vec3d)
-    depth = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.float64)
-    column = measure_crossing(crossing, trees, batch.poses[item[0]], contacts, curves, point, depth)
+    column = measure_crossing(crossing, trees, batch.poses[item[0]], contacts, curves)
     rotation, position = trees.objects.rotation[crossing.a], trees.objects.position[crossing.a]
     if column.depth == NO_DEPTH:
         write_middle(w, crossing.i, rotation * column.normal, contacts, witnesses_out)
     else:
-        write_candidates(w, rotation, position, column, crossing.least, point, depth, witnesses_out)
+        write_candidates(w, rotation, position, column, crossing.least, witnesses_out)

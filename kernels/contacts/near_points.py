@@ -13,19 +13,18 @@ from warp_abtree.kernels.base.arrays import ObjectPool, Trees
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.contacts.contact import Contacts, contact_objects
 from warp_abtree.kernels.contacts.manifold import (
-    CLIPPED_CORNERS,
     COLUMN_CORNERS,
     NO_DEPTH,
     NO_POINT,
     Witnesses,
     column_slack,
+    load_pair,
     measure_column,
     write_candidates,
 )
 from warp_abtree.kernels.contacts.separation import write_near_contact
 from warp_abtree.kernels.contacts.slots import WitnessRows
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK, Hits
-from warp_abtree.kernels.triangle.corners import load_corners
 
 wp.set_module_options(native.options())
 
@@ -88,25 +87,20 @@ def write_facing(
     """
     rotation = trees.objects.rotation[a]
     back = wp.transpose(rotation)
-    corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    load_corners(trees, pose, faces[1 + pose.swapped], faces[2 - pose.swapped], corner)
-    point = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.vec3d)
-    depth = wp.zeros(shape=(CLIPPED_CORNERS,), dtype=wp.float64)
+    pair = load_pair(trees, pose, faces)
     normal_a, normal_b = back * contacts.normal_a[w], back * contacts.normal_b[w]
-    first, separation = 3 * pose.swapped, contacts.separation[w]
-    slack = wp.max(ALIKE * separation, column_slack(corner))
-    best = measure_column(corner, -normal_b, normal_a, normal_b, first, -gap, point, depth)
+    separation = contacts.separation[w]
+    slack = wp.max(ALIKE * separation, column_slack(pair))
+    best = measure_column(pair, normal_a, normal_a, normal_b, -gap)
     # A gap wider than the distance stays so whatever the other normal says.
     if best.depth == NO_DEPTH or -best.depth - separation <= slack:
-        other = measure_column(corner, normal_a, normal_a, normal_b, first, -gap, point, depth)
-        if best.depth > NO_DEPTH and (other.depth == NO_DEPTH or best.depth < other.depth):
-            best = measure_column(corner, -normal_b, normal_a, normal_b, first, -gap, point, depth)
-        else:
+        other = measure_column(pair, -normal_b, normal_a, normal_b, -gap)
+        if other.depth > NO_DEPTH and (best.depth == NO_DEPTH or other.depth < best.depth):
             best = other
     serves = wp.abs(wp.abs(best.depth) - separation) <= slack
     if serves:
         witnesses.nearest_only[w] = wp.where(best.depth > slack, 1, 0)
-        write_candidates(w, rotation, trees.objects.position[a], best, -gap, point, depth, witnesses)
+        write_candidates(w, rotation, trees.objects.position[a], best, -gap, witnesses)
     return serves
 
 

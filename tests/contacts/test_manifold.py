@@ -271,7 +271,8 @@ def test_points_are_those_of_a_plain_choice(device, gap, most):
         turn = quaternion_matrix(placed[0][1][3:])
         taken = choose_plainly(x @ turn, normal @ turn, depth[i], gap or 0.0, most)
         expected = x[taken][np.argsort(x[taken] @ (turn @ along))]
-        np.testing.assert_array_equal(result.points["point"], expected)
+        # Of corners in one place float32 may take another than float64.
+        np.testing.assert_allclose(result.points["point"], expected, atol=1e-9)
         counts.append(len(taken))
     assert max(counts) == most or max(counts) > 12, counts
 

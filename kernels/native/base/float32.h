@@ -18,6 +18,8 @@ struct Float32 {
     static CUDA_CALLABLE float dot(const Point& u, const Point& v) { return fuse(u.x, v.x, fuse(u.y, v.y, u.z * v.z)); }
     static CUDA_CALLABLE float root(float v) { return sqrtf(v); }
     static CUDA_CALLABLE float first(float v) { return v; }
+    static CUDA_CALLABLE int first(int v) { return v; }
+    static CUDA_CALLABLE bool any(bool flag) { return flag; }
     static CUDA_CALLABLE float pick(const float* from, int at) { return from[at]; }
     static CUDA_CALLABLE Point choose(bool which, const Point& a, const Point& b) { return which ? a : b; }
 };
@@ -44,6 +46,8 @@ struct Float32 {
     static lanes every(float v) { return lanes{v, v, v, v, v, v, v, v, v, v, v, v, v, v, v, v}; }
     static lanes root(const lanes& v) { return __builtin_elementwise_sqrt(v); }
     static float first(const lanes& v) { return v[0]; }
+    static int first(const bits& v) { return v[0]; }
+    static bool any(const bits& flags) { return to_mask(flags) != 0; }
     static float pick(const float* from, int at) { return from[at]; }
     static lanes pick(const float* from, const bits& at) {
         lanes x;

@@ -22,7 +22,8 @@ struct NearOffer {
 #endif
     struct Scores : SlotScores<lanes, bits, integers> {
         typedef SlotScores<lanes, bits, integers> Base;
-        bits inside;
+        bits inside, counts;
+        CUDA_CALLABLE Scores() {}
         CUDA_CALLABLE Scores(const Vector& n, const float* directions) : Base(n, directions) {}
     };
 
@@ -82,9 +83,16 @@ struct NearOffer {
             lowest = joined.height[k] < lowest ? joined.height[k] : lowest;
         const bits fits = (separation >= 0.0f) | (-lowest <= distance * (1.0f + 0x1p-10f) + size * 0x1p-20f);
         const bits counts = (distance <= gap) & fits & (along | ((ahead_a > least) & (ahead_b > least)));
+        if (!F::any(counts)) {
+            Scores none;
+            none.inside = counts;
+            none.counts = counts;
+            return none;
+        }
         const Point n = F::choose(along, F::minus(joined.normal_a, joined.normal_b), joined.way);
         Scores scores(vector_of(n), directions);
         scores.inside = inside;
+        scores.counts = counts;
         // What touches beside a column, perhaps looking away, goes behind all that is in one.
         const lanes rank = column ? separation : separation + (along ? zero + gap : zero);
         scores.offer(weight, vector_of(N::add(joined.at, zero + 0.5f, joined.way)), rank, counts);
@@ -98,36 +106,37 @@ struct NearOffer {
     static CUDA_CALLABLE void put(const Scores& scores, int lane, int place, wp::int64* slots,
                                   const wp::vec_t<3, wp::int32>* list) {
 #if defined(__CUDA_ARCH__)
-        const int bin = scores.bin / 9;
-        const bool inside = scores.inside;
+        if (scores.counts)
+            put_into_slots(slots + SLOTS_A_BIN * (scores.bin / 9) + (scores.inside ? 2 * SCORES : SCORES), scores.score,
+                           scores.inside ? 1 : SCORES, place, list);
 #else
-        const int bin = scores.bin[lane] / 9;
+        float own[SCORES];
+        for (int k = 0; k < SCORES && scores.counts[lane]; ++k)
+            own[k] = scores.score[k][lane];
         const bool inside = scores.inside[lane] != 0;
+        if (scores.counts[lane])
+            put_into_slots(slots + SLOTS_A_BIN * (scores.bin[lane] / 9) + (inside ? 2 * SCORES : SCORES), own,
+                           inside ? 1 : SCORES, place, list);
 #endif
-        wp::int64* const slot = slots + SLOTS_A_BIN * bin + (inside ? 2 * SCORES : SCORES);
-        for (int k = 0; k < (inside ? 1 : SCORES); ++k) {
-#if defined(__CUDA_ARCH__)
-            const float score = scores.score[k];
-#else
-            const float score = scores.score[k][lane];
-#endif
-            if (score > NO_SCORE)
-                put_into_slot(slot + k, make_slot_key(score, place), list);
-        }
     }
 };
+
+// The corners of one face, in rows, in all lanes.
+template <class Rows>
+CUDA_CALLABLE void spread_corners(const Rows& rows, Float32::Point (&corners)[3]) {
+    const Float32::lanes zero = {};
+    for (int k = 0; k < 3; ++k)
+        corners[k] = Float32::Point{zero + rows.data[k][0], zero + rows.data[k][1], zero + rows.data[k][2]};
+}
 
 template <class Corners>
 CUDA_CALLABLE void offer_faces(const Corners& a, const Corners& b, wp::float32 gap, wp::float32 weight,
                                wp::array_t<wp::float32> directions, wp::int32 place, wp::int32 pair,
                                wp::array_t<wp::vec_t<3, wp::int32>> list, wp::array_t<wp::int64> slots) {
     typedef NearOffer O;
-    const O::lanes zero = {};
     O::N::Corners c;
-    for (int k = 0; k < 3; ++k) {
-        c.a[k] = O::Point{zero + a.data[k][0], zero + a.data[k][1], zero + a.data[k][2]};
-        c.b[k] = O::Point{zero + b.data[k][0], zero + b.data[k][1], zero + b.data[k][2]};
-    }
+    spread_corners(a, c.a);
+    spread_corners(b, c.b);
     const O::Scores scores = O::rate(c, gap, weight, directions.data);
     O::put(scores, 0, place, slots.data + (wp::int64)pair * SLOT_ROOM, list.data);
 }

@@ -23,6 +23,7 @@ struct SlotScores {
     static CUDA_CALLABLE L dot(const Vector& u, const Vector& v) {
         return Float32::fuse(u.x, v.x, Float32::fuse(u.y, v.y, u.z * v.z));
     }
+    CUDA_CALLABLE SlotScores() {}
     // Directions: normals of bins and two vectors across each, by component.
     CUDA_CALLABLE SlotScores(const Vector& n, const float* directions) {
         const L none = L{} + NO_SCORE;
@@ -75,20 +76,32 @@ inline CUDA_CALLABLE bool beats(wp::int64 key, wp::int64 other, const wp::vec_t<
     return p[1] < q[1] || (p[1] == q[1] && p[2] < q[2]);
 }
 
-// Keeps the best of all keys, whatever their order.
-inline CUDA_CALLABLE void put_into_slot(wp::int64* slot, wp::int64 key, const wp::vec_t<3, wp::int32>* list) {
+// Puts scores into slots side by side, which keep the best of all keys, whatever their order.
+inline CUDA_CALLABLE void put_into_slots(wp::int64* slots, const float* scores, int count, unsigned int place,
+                                         const wp::vec_t<3, wp::int32>* list) {
 #if defined(__CUDA_ARCH__)
-    long long other = __ldcg((const long long*)slot);
-    while (beats(key, other, list)) {
-        const long long before =
-            (long long)atomicCAS((unsigned long long*)slot, (unsigned long long)other, (unsigned long long)key);
-        if (before == other)
-            return;
-        other = before;
+    // All loads before any atomic, so that they are under way together.
+    long long others[SCORES];
+#pragma unroll
+    for (int k = 0; k < SCORES; ++k)
+        others[k] = k < count ? __ldcg((const long long*)slots + k) : 0;
+#pragma unroll
+    for (int k = 0; k < SCORES; ++k) {
+        const long long key = make_slot_key(scores[k], place);
+        while (k < count && scores[k] > NO_SCORE && beats(key, others[k], list)) {
+            const long long before = (long long)atomicCAS((unsigned long long*)slots + k, (unsigned long long)others[k],
+                                                          (unsigned long long)key);
+            if (before == others[k])
+                break;
+            others[k] = before;
+        }
     }
 #else
-    if (beats(key, *slot, list))
-        *slot = key;
+    for (int k = 0; k < count; ++k) {
+        const wp::int64 key = make_slot_key(scores[k], place);
+        if (scores[k] > NO_SCORE && beats(key, slots[k], list))
+            slots[k] = key;
+    }
 #endif
 }
 
@@ -100,6 +113,5 @@ inline CUDA_CALLABLE void offer_point(wp::vec_t<3, wp::float32> normal, wp::vec_
     Scores scores({normal[0], normal[1], normal[2]}, directions.data);
     scores.offer(weight, {point[0], point[1], point[2]}, separation, true);
     wp::int64* const slot = slots.data + (wp::int64)pair * SLOT_ROOM + SLOTS_A_BIN * (scores.bin / 9);
-    for (int k = 0; k < SCORES; ++k)
-        put_into_slot(slot + k, make_slot_key(scores.score[k], CROSSING_BIT | (unsigned int)place), list.data);
+    put_into_slots(slot, scores.score, SCORES, CROSSING_BIT | (unsigned int)place, list.data);
 }

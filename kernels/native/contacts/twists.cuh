@@ -13,7 +13,6 @@ struct TwistChoice {
     typedef int integers;
     static constexpr int LANES = 1, GROUPS = 1;
     static CUDA_CALLABLE lanes load(const float* from) { return from[threadIdx.x]; }
-    static CUDA_CALLABLE bool any(bool flag) { return flag; }
     template <class Number>
     static CUDA_CALLABLE Number get_lane(const Number& v, int) {
         return v;
@@ -23,7 +22,6 @@ struct TwistChoice {
     typedef float loose __attribute__((vector_size(64), aligned(4)));
     static constexpr int LANES = 16, GROUPS = TWIST_COUNT / 16;
     static lanes load(const float* from) { return *(const loose*)from; }
-    static bool any(const F::bits& flags) { return F::to_mask(flags) != 0; }
     static float get_lane(const lanes& v, int k) { return v[k]; }
     static int get_lane(const integers& v, int k) { return v[k]; }
 #endif
@@ -90,7 +88,7 @@ struct TwistChoice {
         const lanes rate = rate_of(t, c), closing = -rate;
         const auto stops = (closing > 0x1p-20f) & (c.separation < t.stop * closing);
         t.stop = stops ? c.separation / closing : t.stop;
-        if (any(stops))
+        if (F::any(stops))
             find_worst(t);
     }
 };
