@@ -10,7 +10,6 @@ from warp_abtree.kernels.contacts.slots import Slots, WitnessRows, offer_point
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair
 from warp_abtree.kernels.triangle.distance import largest_coordinate
-from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
 wp.set_module_options(native.options("contacts/slots.cuh"))
 
@@ -118,20 +117,25 @@ class Column:
     v0: wp.vec3d  # corners of the other one
     v1: wp.vec3d  # the second
     v2: wp.vec3d  # the third
-    side0: wp.vec3d  # unit normals of the column's sides, inwards
+    side0: wp.vec3d  # normals of the column's sides, inwards, of any length
     side1: wp.vec3d  # the second
     side2: wp.vec3d  # the third
-    slack: wp.vec3d  # by which each side is wider
+    slack: wp.vec3d  # by which each side is wider, times that length
+
+
+@wp.func
+def sum_sizes(v: wp.vec3d):
+    return (wp.abs(v[0]) + wp.abs(v[1])) + wp.abs(v[2])
 
 
 @wp.func
 def make_side(n: wp.vec3d, u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
     """Return the inward normal of the side of a column over the edge from u to v, w the third corner, and its slack."""
     edge, across = v - u, w - u
-    inward = unit_vector(wp.cross(edge, n))
+    inward = wp.cross(edge, n)
     if wp.dot(inward, across) < wp.float64(0.0):
         inward = -inward
-    return inward, COLUMN_SLACK * (measure_length(edge) + measure_length(across))
+    return inward, COLUMN_SLACK * (sum_sizes(edge) + sum_sizes(across)) * sum_sizes(inward)
 
 
 @wp.func
@@ -183,23 +187,60 @@ def pierce_cut(column: Column, u: wp.vec3d):
 
 
 @wp.func
+def edge_of(column: Column, i: wp.int32):
+    """Return edge i of what a column cuts, from corner to corner, and between which parameters it lies within."""
+    p = wp.where(i == 0, column.v0, wp.where(i == 1, column.v1, column.v2))
+    q = wp.where(i == 0, column.v1, wp.where(i == 1, column.v2, column.v0))
+    return p, q, clip_edge(column, p, q)
+
+
+@wp.func
+def ends_before(range: wp.vec2d):
+    """Return whether an edge leaves a column before its end, which is where the next one starts."""
+    return range[1] < wp.float64(1.0) and range[0] < range[1]
+
+
+@wp.func
+def depth_of(column: Column, point: wp.vec3d):
+    return wp.dot(column.u0 - point, column.plane)
+
+
+@wp.func
 def corner_of(column: Column, k: wp.int32):
     """Return the k-th corner of what a column cuts, its depth, and whether there is one, k = 0 .. 8."""
-    zero, one = wp.float64(0.0), wp.float64(1.0)
     point, exists = wp.vec3d(), False
     if k < 6:
-        p = wp.where(k < 2, column.v0, wp.where(k < 4, column.v1, column.v2))
-        q = wp.where(k < 2, column.v1, wp.where(k < 4, column.v2, column.v0))
-        range = clip_edge(column, p, q)
-        # The end of an edge, where it is within, is the start of the next.
-        exists = range[0] <= range[1] and (k % 2 == 0 or (range[1] < one and range[0] < range[1]))
+        p, q, range = edge_of(column, k / 2)
+        exists = range[0] <= range[1] and (k % 2 == 0 or ends_before(range))
         t = range[k % 2]
         point = p
-        if t > zero:
+        if t > wp.float64(0.0):
             point = p + (q - p) * t
     else:
         point, exists = pierce_cut(column, wp.where(k == 6, column.u0, wp.where(k == 7, column.u1, column.u2)))
-    return point, wp.dot(column.u0 - point, column.plane), exists
+    return point, depth_of(column, point), exists
+
+
+@wp.func
+def raise_depth(depth: wp.float64, least: wp.float64, exists: bool, of_corner: wp.float64):
+    return wp.where(exists and of_corner >= least, wp.max(depth, of_corner), depth)
+
+
+@wp.func
+def deepest_corner(column: Column, least: wp.float64):
+    """Return how deep the deepest corner is that is deep enough, NO_DEPTH where there is none."""
+    depth, i = wp.float64(NO_DEPTH), wp.int32(0)
+    while i < 3:
+        p, q, range = edge_of(column, i)
+        # Depth is linear along the edge.
+        at_p, at_q = depth_of(column, p), depth_of(column, q)
+        exists = range[0] <= range[1]
+        depth = raise_depth(depth, least, exists, at_p + (at_q - at_p) * range[0])
+        depth = raise_depth(depth, least, exists and ends_before(range), at_p + (at_q - at_p) * range[1])
+        point, pierces = pierce_cut(column, wp.where(i == 0, column.u0, wp.where(i == 1, column.u1, column.u2)))
+        depth = raise_depth(depth, least, pierces, depth_of(column, point))
+        i += 1
+    return depth
 
 
 @wp.func
@@ -230,12 +271,7 @@ def measure_column(pair: FacePair, n: wp.vec3d, normal_a: wp.vec3d, normal_b: wp
     column.side1 = side1
     column.side2 = side2
     column.slack = wp.vec3d(s0, s1, s2)
-    k = wp.int32(0)
-    while k < POSSIBLE_CORNERS:
-        _, depth, exists = corner_of(column, k)
-        if exists and depth >= least:
-            column.depth = wp.max(column.depth, depth)
-        k += 1
+    column.depth = deepest_corner(column, least)
     return column
 
 
