@@ -6,7 +6,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.contacts.contact import Contacts
-from warp_abtree.kernels.contacts.slots import Slots, WitnessRows, offer_point
+from warp_abtree.kernels.contacts.slots import Slots, WitnessRows, offer_point, scattered_place
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair
 from warp_abtree.kernels.triangle.distance import largest_coordinate
@@ -406,9 +406,11 @@ def offer_crossing_kernel(
             at all.
         start, faces, order: Contacts of pairs, as for `loops`, in the order of loops.
     """
-    if wp.tid() >= start[start.shape[0] - 1]:
+    count = start[start.shape[0] - 1]
+    at = scattered_place(wp.tid(), count)
+    if at >= count:
         return
-    i = order[wp.tid()]
+    i = order[at]
     crossing = load_crossing(i, batch, gap, faces[i], contacts)
     p = faces[i][0]
     pose = batch.poses[p]

@@ -37,6 +37,8 @@ wp.set_module_options(native.options("base/lanes.cuh", "contacts/near_offer.cuh"
 NORMAL_BINS, SLOTS_A_BIN, SLOT_ROOM = (native.constant(name) for name in ("NORMAL_BINS", "SLOTS_A_BIN", "SLOT_ROOM"))
 ALL_SLOTS = wp.constant(wp.int64(SLOT_ROOM))
 NO_KEY = wp.constant(wp.int64(1 - 2**63))
+# Items side by side that are offered together, and a prime beyond any number of them.
+SCATTERED, SCATTERING = wp.constant(32), wp.constant(wp.int64(2**31 - 1))
 # Directions count so much at least, where gaps are tiny.
 WEIGHT_LEAST = wp.constant(wp.float64(2.0**-8))
 
@@ -137,20 +139,36 @@ def start_slots_kernel(
         slots_out.measures[p] = wp.vec2(wp.float32(shell * batch.poses[p].scale), wp.float32(wp.min(weight, one)))
 
 
+@wp.func
+def scattered_place(i: wp.int32, count: wp.int32):
+    """Return which of so many items thread i offers, `count` or more for none; threads beyond the count have some too.
+
+    In the order of the lists places move steadily, and half of all offers would go beyond those before them.
+    """
+    chunks = (count + SCATTERED - 1) / SCATTERED
+    at = wp.int32(count)
+    if i < SCATTERED * chunks:
+        at = SCATTERED * wp.int32(wp.int64(i / SCATTERED) * SCATTERING % wp.int64(chunks)) + i % SCATTERED
+    return at
+
+
 @wp.kernel
 def offer_near_kernel(step: wp.int32, trees: Trees, batch: PairBatch, hits: Hits, slots_inout: Slots):
     """Offer the face pairs that are listed as apart to the slots of their object pairs, in a grid-stride loop."""
-    i = wp.uint32(wp.tid())
-    end = wp.min(wp.uint32(hits.apart_total[0]), wp.uint32(hits.apart.shape[0]))
-    while i < end:
-        row = hits.apart[i]
+    i = wp.tid()
+    end = wp.int32(wp.min(wp.uint32(hits.apart_total[0]), wp.uint32(hits.apart.shape[0])))
+    while i < end + SCATTERED:
+        at = scattered_place(i, end)
+        i += step
+        if at >= end:
+            continue
+        row = hits.apart[at]
         pose = batch.poses[row[0]]
         scale = wp.float32(pose.scale)
         a, b = load_points(trees, pose, pose.translation32 * scale, scale, row[1], row[2])
         measures = slots_inout.measures[row[0]]
         directions = slots_inout.directions
-        offer_faces(a, b, measures[0], measures[1], directions, wp.int32(i), row[0], hits.apart, slots_inout.key)
-        i += wp.uint32(step)
+        offer_faces(a, b, measures[0], measures[1], directions, at, row[0], hits.apart, slots_inout.key)
 
 
 @wp.kernel

@@ -80,24 +80,15 @@ inline CUDA_CALLABLE bool beats(wp::int64 key, wp::int64 other, const wp::vec_t<
 inline CUDA_CALLABLE void put_into_slots(wp::int64* slots, const float* scores, int count, unsigned int place,
                                          const wp::vec_t<3, wp::int32>* list) {
 #if defined(__CUDA_ARCH__)
-    // Of the threads of a warp that have the same slots the best goes on alone; all loads before any atomic, so that
-    // they are under way together.
-    const unsigned int group = __match_any_sync(__activemask(), (unsigned long long)slots);
+    // All loads before any atomic, so that they are under way together.
     long long others[SCORES];
-    unsigned int goes_on = 0;
-#pragma unroll
-    for (int k = 0; k < SCORES; ++k) {
-        const int score = (int)(make_slot_key(scores[k], 0) >> 32);
-        if (k < count && __reduce_max_sync(group, score) == score && scores[k] > NO_SCORE)
-            goes_on |= 1u << k;
-    }
 #pragma unroll
     for (int k = 0; k < SCORES; ++k)
-        others[k] = goes_on >> k & 1 ? __ldcg((const long long*)slots + k) : 0;
+        others[k] = k < count ? __ldcg((const long long*)slots + k) : 0;
 #pragma unroll
     for (int k = 0; k < SCORES; ++k) {
         const long long key = make_slot_key(scores[k], place);
-        while ((goes_on >> k & 1) && beats(key, others[k], list)) {
+        while (k < count && scores[k] > NO_SCORE && beats(key, others[k], list)) {
             const long long before = (long long)atomicCAS((unsigned long long*)slots + k, (unsigned long long)others[k],
                                                           (unsigned long long)key);
             if (before == others[k])
