@@ -396,7 +396,6 @@ def offer_crossing_kernel(
     order: wp.array(dtype=wp.int32),
     contacts: Contacts,
     curves: Curves,
-    hits: Hits,
     slots_inout: Slots,
 ):
     """Offer the candidates of one contact of faces that cross a thread to the slots of its pair.
@@ -420,7 +419,7 @@ def offer_crossing_kernel(
     weight, directions = slots_inout.measures[p][1], slots_inout.directions
     if column.depth == NO_DEPTH:
         # Behind whatever has a depth.
-        offer_point(n, wp.vec3(), NO_DEPTH_SEPARATION, weight, directions, i, p, hits.apart, slots_inout.key)
+        offer_point(n, wp.vec3(), NO_DEPTH_SEPARATION, weight, directions, i, p, slots_inout.key)
         return
     centre = trees.models.centre[trees.states.model[trees.objects.state[crossing.a]]]
     k = wp.int32(0)
@@ -428,7 +427,7 @@ def offer_crossing_kernel(
         point, depth, exists = corner_of(column, k)
         if exists and depth >= crossing.least:
             x, s = wp.vec3((point - centre) * pose.scale), wp.float32(-depth * pose.scale)
-            offer_point(n, x, s, weight, directions, i, p, hits.apart, slots_inout.key)
+            offer_point(n, x, s, weight, directions, i, p, slots_inout.key)
         k += 1
 
 

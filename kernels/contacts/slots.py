@@ -13,12 +13,12 @@ within the column of the other face counts as a point of its own; others have th
 either face looks away from it. Who wins is measured in float64 (`near_points`).
 
 Scores are float32, in A's frame at unit size: the depth, and for directions the reach times the pair's weight, the gap
-over the size of the smaller object. A key of a slot is
+over the size of the smaller object. A key of a slot is a score above a name: the place of a contact that crosses, or
+both faces of a pair that is apart, in as many bits as there are; the score has the rest. Of equal scores the lower name
+wins.
 
-    63              32 31           0
-    [ sortable score  |   place    ]    place: of a crossing contact, with bit 31, or in the list of near face pairs
-
-Of equal scores what crosses goes before what is apart, then the lower place of a contact, or the lower faces.
+    63          n n-1          0
+    [   score    |    ~name    ]    n = 32, or as many bits as names of faces take beyond
 """
 
 import warp as wp
@@ -29,14 +29,13 @@ from warp_abtree.kernels.base.lanes import next_place, warp_lane, warp_size, war
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
-from warp_abtree.kernels.search.item import INDEX_MASK
 from warp_abtree.kernels.triangle.distance_bounds import load_points, three_points
 
 wp.set_module_options(native.options("base/lanes.cuh", "contacts/near_offer.cuh", "contacts/offer_list.h"))
 
-NORMAL_BINS, SLOTS_A_BIN, SLOT_ROOM = (native.constant(name) for name in ("NORMAL_BINS", "SLOTS_A_BIN", "SLOT_ROOM"))
+NORMAL_BINS, SCORES = native.constant("NORMAL_BINS"), native.constant("SCORES")
+SLOTS_A_BIN, SLOT_ROOM = native.constant("SLOTS_A_BIN"), native.constant("SLOT_ROOM")
 ALL_SLOTS = wp.constant(wp.int64(SLOT_ROOM))
-NO_KEY = wp.constant(wp.int64(1 - 2**63))
 # Items side by side that are offered together, and a prime beyond any number of them.
 SCATTERED, SCATTERING = wp.constant(32), wp.constant(wp.int64(2**31 - 1))
 # Directions count so much at least, where gaps are tiny.
@@ -47,7 +46,8 @@ WEIGHT_LEAST = wp.constant(wp.float64(2.0**-8))
 class Slots:
     """Slots of all object pairs."""
 
-    key: wp.array(dtype=wp.int64)  # NO_KEY where there is none, shape [SLOT_ROOM * pair]
+    key: wp.array(dtype=wp.int64)  # unsigned, 0 where there is none, shape [SLOT_ROOM * pair]
+    widths: wp.array(dtype=wp.vec2i)  # bits that a face of A takes, and one of B, shape [pair]
     measures: wp.array(dtype=wp.vec2)  # gap at unit size, and weight of directions, shape [pair]
     directions: wp.array(dtype=wp.float32)  # normal of each bin and two vectors across it, shape [9 * NORMAL_BINS]
 
@@ -69,12 +69,13 @@ def offer_faces(
     gap: wp.float32,
     weight: wp.float32,
     directions: wp.array(dtype=wp.float32),
-    place: wp.int32,
+    widths: wp.vec2i,
+    face_a: wp.int32,
+    face_b: wp.int32,
     pair: wp.int32,
-    list: wp.array(dtype=wp.vec3i),
     slots: wp.array(dtype=wp.int64),
 ):
-    """Offer a listed face pair that is apart, in A's frame at unit size, to the slots of its object pair."""
+    """Offer a face pair that is apart, in A's frame at unit size, to the slots of its object pair."""
 
 
 @native.func_native()
@@ -86,7 +87,6 @@ def offer_point(
     directions: wp.array(dtype=wp.float32),
     place: wp.int32,
     pair: wp.int32,
-    list: wp.array(dtype=wp.vec3i),
     slots: wp.array(dtype=wp.int64),
 ):
     """Offer a point of a crossing contact, in A's frame at unit size, to the slots of its object pair."""
@@ -101,6 +101,7 @@ def simd_offer_list(
     list: wp.array(dtype=wp.vec3i),
     measures: wp.array(dtype=wp.vec2),
     directions: wp.array(dtype=wp.float32),
+    widths: wp.array(dtype=wp.vec2i),
     slots: wp.array(dtype=wp.int64),
 ):
     """Offer so many listed face pairs to the slots of their object pairs, 16 at a time."""
@@ -111,6 +112,15 @@ def tree_size(trees: Trees, state: wp.int32):
     """Return half of the diagonal of the root box of a tree state."""
     root = load_node(trees.states, trees.states.node_start[state] + 1)
     return wp.float64(0.5) * wp.length(wp.vec3d(root.upper) - wp.vec3d(root.lower))
+
+
+@wp.func
+def count_bits(trees: Trees, state: wp.int32):
+    """Return how many bits a face of a tree state takes."""
+    bits, faces = wp.int32(1), trees.models.face_count[trees.states.model[state]]
+    while (faces - 1) >> bits > 0:
+        bits += 1
+    return bits
 
 
 @wp.kernel
@@ -124,7 +134,7 @@ def start_slots_kernel(
     """
     i = wp.tid()
     p = i / SLOT_ROOM
-    slots_out.key[i] = NO_KEY
+    slots_out.key[i] = wp.int64(0)
     if i == 0:
         hits_out.witness_total[0] = 0
     if i == p * SLOT_ROOM and p < batch.count[0] and p < batch.pairs.shape[0]:
@@ -136,6 +146,9 @@ def start_slots_kernel(
         weight = WEIGHT_LEAST
         if shell > WEIGHT_LEAST * size:
             weight = wp.min(shell, size) / wp.max(size, wp.min(shell, size))
+        swapped = batch.poses[p].swapped != 0
+        of_a, of_b = count_bits(trees, wp.where(swapped, b, a)), count_bits(trees, wp.where(swapped, a, b))
+        slots_out.widths[p] = wp.vec2i(of_a, of_b)
         slots_out.measures[p] = wp.vec2(wp.float32(shell * batch.poses[p].scale), wp.float32(wp.min(weight, one)))
 
 
@@ -166,27 +179,45 @@ def offer_near_kernel(step: wp.int32, trees: Trees, batch: PairBatch, hits: Hits
         pose = batch.poses[row[0]]
         scale = wp.float32(pose.scale)
         a, b = load_points(trees, pose, pose.translation32 * scale, scale, row[1], row[2])
-        measures = slots_inout.measures[row[0]]
+        measures, widths = slots_inout.measures[row[0]], slots_inout.widths[row[0]]
         directions = slots_inout.directions
-        offer_faces(a, b, measures[0], measures[1], directions, at, row[0], hits.apart, slots_inout.key)
+        offer_faces(a, b, measures[0], measures[1], directions, widths, row[1], row[2], row[0], slots_inout.key)
 
 
 @wp.kernel
 def offer_list_kernel(trees: Trees, batch: PairBatch, hits: Hits, slots_inout: Slots):
     """Do what `offer_near_kernel` does, 16 face pairs at a time, by one thread; CPU only."""
     count = wp.int32(wp.min(wp.uint32(hits.apart_total[0]), wp.uint32(hits.apart.shape[0])))
-    measures, directions = slots_inout.measures, slots_inout.directions
-    simd_offer_list(trees.models, trees.states, batch.poses, count, hits.apart, measures, directions, slots_inout.key)
+    measures, directions, widths = slots_inout.measures, slots_inout.directions, slots_inout.widths
+    simd_offer_list(
+        trees.models, trees.states, batch.poses, count, hits.apart, measures, directions, widths, slots_inout.key
+    )
 
 
 @wp.func
-def is_first(slots: Slots, at: wp.int32):
-    """Return whether a slot keeps a witness that no slot before it in its bin keeps."""
+def crosses(at: wp.int32):
+    """Return whether a slot is one of contacts that cross."""
+    return at % SLOTS_A_BIN < SCORES
+
+
+@wp.func
+def name_in(slots: Slots, p: wp.int32, at: wp.int32):
+    """Return the name of what a slot of an object pair keeps, -1 for none."""
     key = slots.key[at]
-    if key == NO_KEY:
+    width = wp.where(crosses(at), 32, slots.widths[p][0] + slots.widths[p][1])
+    if key == wp.int64(0):
+        return wp.int64(-1)
+    return ~key & ((wp.int64(1) << wp.int64(width)) - wp.int64(1))
+
+
+@wp.func
+def is_first(slots: Slots, p: wp.int32, at: wp.int32):
+    """Return whether a slot keeps a witness that no slot of its kind before it in its bin keeps."""
+    name = name_in(slots, p, at)
+    if name < wp.int64(0):
         return False
     k = at - at % SLOTS_A_BIN
-    while k < at and (slots.key[k] == NO_KEY or wp.int32(slots.key[k]) != wp.int32(key)):
+    while k < at and (crosses(k) != crosses(at) or name_in(slots, p, k) != name):
         k += 1
     return k == at
 
@@ -202,7 +233,7 @@ def reserve_witness_kernel(batch: PairBatch, slots: Slots, hits_inout: Hits, row
         return
     while first < SLOT_ROOM:
         k = first + warp_lane()
-        _ = next_place(found, k < SLOT_ROOM and is_first(slots, SLOT_ROOM * p + wp.min(k, SLOT_ROOM - 1)))
+        _ = next_place(found, k < SLOT_ROOM and is_first(slots, p, SLOT_ROOM * p + wp.min(k, SLOT_ROOM - 1)))
         first += warp_size()
     if warp_lane() == 0:
         count = wp.min(SLOT_ROOM, found + wp.int32(wp.min(hits_inout.count[p], ALL_SLOTS)))
@@ -211,7 +242,7 @@ def reserve_witness_kernel(batch: PairBatch, slots: Slots, hits_inout: Hits, row
 
 
 @wp.kernel
-def list_witness_kernel(batch: PairBatch, slots: Slots, hits: Hits, rows_inout: WitnessRows):
+def list_witness_kernel(batch: PairBatch, slots: Slots, rows_inout: WitnessRows):
     """List what the slots of one object pair keep, by a warp; places that are left say so."""
     p = wp.tid() / warp_size()
     count = rows_inout.count[p]
@@ -226,14 +257,15 @@ def list_witness_kernel(batch: PairBatch, slots: Slots, hits: Hits, rows_inout: 
         k = SLOT_ROOM * p + wp.min(first + warp_lane(), SLOT_ROOM - 1)
         kept = first + warp_lane() < SLOT_ROOM
         if kept:
-            kept = is_first(slots, k)
+            kept = is_first(slots, p, k)
         place = next_place(end, kept)
         if kept:
-            at = wp.int32(slots.key[k])
-            item = wp.vec3i(p, at & INDEX_MASK, 0)
-            if at >= 0:
-                row = hits.apart[at]
-                item = wp.vec3i(p | NEAR_BIT, row[1 + swapped], row[2 - swapped])
+            name = name_in(slots, p, k)
+            item = wp.vec3i(p, wp.int32(name), 0)
+            if not crosses(k):
+                width = wp.int64(slots.widths[p][1])
+                a, b = wp.int32(name >> width), wp.int32(name & ((wp.int64(1) << width) - wp.int64(1)))
+                item = wp.vec3i(p | NEAR_BIT, wp.where(swapped != 0, b, a), wp.where(swapped != 0, a, b))
             rows_inout.item[start + place] = item
         first += warp_size()
     if start >= 0:

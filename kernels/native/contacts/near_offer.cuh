@@ -103,20 +103,23 @@ struct NearOffer {
         return scores;
     }
     // Puts the scores of a lane into the slots of its object pair: of what is inside the deepest alone.
-    static CUDA_CALLABLE void put(const Scores& scores, int lane, int place, wp::int64* slots,
-                                  const wp::vec_t<3, wp::int32>* list) {
+    static CUDA_CALLABLE void put(const Scores& scores, int lane, const wp::vec_t<2, wp::int32>& widths, int face_a,
+                                  int face_b, wp::int64* slots) {
+        const unsigned long long name = ((unsigned long long)face_a << widths[1]) | (unsigned int)face_b;
+        const int width = widths[0] + widths[1];
 #if defined(__CUDA_ARCH__)
         if (scores.counts)
             put_into_slots(slots + SLOTS_A_BIN * (scores.bin / 9) + (scores.inside ? 2 * SCORES : SCORES), scores.score,
-                           scores.inside ? 1 : SCORES, place, list);
+                           scores.inside ? 1 : SCORES, width, name);
 #else
+        if (!scores.counts[lane])
+            return;
         float own[SCORES];
-        for (int k = 0; k < SCORES && scores.counts[lane]; ++k)
+        for (int k = 0; k < SCORES; ++k)
             own[k] = scores.score[k][lane];
         const bool inside = scores.inside[lane] != 0;
-        if (scores.counts[lane])
-            put_into_slots(slots + SLOTS_A_BIN * (scores.bin[lane] / 9) + (inside ? 2 * SCORES : SCORES), own,
-                           inside ? 1 : SCORES, place, list);
+        put_into_slots(slots + SLOTS_A_BIN * (scores.bin[lane] / 9) + (inside ? 2 * SCORES : SCORES), own,
+                       inside ? 1 : SCORES, width, name);
 #endif
     }
 };
@@ -131,12 +134,12 @@ CUDA_CALLABLE void spread_corners(const Rows& rows, Float32::Point (&corners)[3]
 
 template <class Corners>
 CUDA_CALLABLE void offer_faces(const Corners& a, const Corners& b, wp::float32 gap, wp::float32 weight,
-                               wp::array_t<wp::float32> directions, wp::int32 place, wp::int32 pair,
-                               wp::array_t<wp::vec_t<3, wp::int32>> list, wp::array_t<wp::int64> slots) {
+                               wp::array_t<wp::float32> directions, wp::vec_t<2, wp::int32> widths, wp::int32 face_a,
+                               wp::int32 face_b, wp::int32 pair, wp::array_t<wp::int64> slots) {
     typedef NearOffer O;
     O::N::Corners c;
     spread_corners(a, c.a);
     spread_corners(b, c.b);
     const O::Scores scores = O::rate(c, gap, weight, directions.data);
-    O::put(scores, 0, place, slots.data + (wp::int64)pair * SLOT_ROOM, list.data);
+    O::put(scores, 0, widths, face_a, face_b, slots.data + (wp::int64)pair * SLOT_ROOM);
 }

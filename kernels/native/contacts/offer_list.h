@@ -7,7 +7,8 @@
 template <class ModelPool, class StatePool, class PairPose>
 void simd_offer_list(const ModelPool& models, const StatePool& states, wp::array_t<PairPose> pair_poses, wp::int32 count,
                      wp::array_t<wp::vec_t<3, wp::int32>> list, wp::array_t<wp::vec_t<2, wp::float32>> measures,
-                     wp::array_t<wp::float32> directions, wp::array_t<wp::int64> slots) {
+                     wp::array_t<wp::float32> directions, wp::array_t<wp::vec_t<2, wp::int32>> widths,
+                     wp::array_t<wp::int64> slots) {
     typedef NearOffer O;
     for (int first = 0, some; first < count; first += some) {
         const int pair = list.data[first][0];
@@ -25,6 +26,6 @@ void simd_offer_list(const ModelPool& models, const StatePool& states, wp::array
         const O::Scores scores = O::rate(corners, measures.data[pair][0], measures.data[pair][1], directions.data);
         wp::int64* const own = slots.data + (wp::int64)pair * SLOT_ROOM;
         for (int i = 0; i < some; ++i)
-            O::put(scores, i, first + i, own, list.data);
+            O::put(scores, i, widths.data[pair], list.data[first + i][1], list.data[first + i][2], own);
     }
 }

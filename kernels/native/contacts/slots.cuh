@@ -6,9 +6,6 @@
 
 // A score that none has.
 constexpr float NO_SCORE = -0x1p126f;
-constexpr wp::int64 NO_KEY = -0x7fffffffffffffff;
-// The bit of a place that is a crossing contact, not one of the list of near face pairs.
-constexpr unsigned int CROSSING_BIT = 0x80000000u;
 
 // Scores of points, of one or of 16: L numbers, B flags, I whole numbers.
 template <class L, class B, class I>
@@ -55,52 +52,38 @@ struct SlotScores {
     }
 };
 
-// A score as a number that sorts alike, above a place.
-inline CUDA_CALLABLE wp::int64 make_slot_key(float score, unsigned int place) {
+// A score as a number that sorts alike, above the bits of a name, of which the lower comes first.
+inline CUDA_CALLABLE unsigned long long make_slot_key(float score, int width, unsigned long long name) {
     union {
         float x;
-        int bits;
+        unsigned int bits;
     } number = {score};
-    const int sorted = number.bits < 0 ? (int)(0x80000000u - (unsigned int)number.bits) : number.bits;
-    return ((wp::int64)sorted << 32) | place;
+    const unsigned int sorted = number.bits >> 31 ? ~number.bits : number.bits | 0x80000000u;
+    const unsigned long long kept = width > 32 ? sorted >> (width - 32) : sorted;
+    return (kept << (width > 32 ? width : 32)) | (((1ull << width) - 1) & ~name);
 }
 
-// Of equal scores what crosses, then the lower place of contacts, and the lower faces of the list.
-inline CUDA_CALLABLE bool beats(wp::int64 key, wp::int64 other, const wp::vec_t<3, wp::int32>* list) {
-    if (other == NO_KEY || (key >> 32) != (other >> 32))
-        return other == NO_KEY || key > other;
-    const unsigned int place = (unsigned int)key, there = (unsigned int)other;
-    if ((place | there) & CROSSING_BIT)
-        return (place & CROSSING_BIT) && (!(there & CROSSING_BIT) || place < there);
-    const wp::vec_t<3, wp::int32>&p = list[place], &q = list[there];
-    return p[1] < q[1] || (p[1] == q[1] && p[2] < q[2]);
-}
-
-// Puts scores into slots side by side, which keep the best of all keys, whatever their order.
-inline CUDA_CALLABLE void put_into_slots(wp::int64* slots, const float* scores, int count, unsigned int place,
-                                         const wp::vec_t<3, wp::int32>* list) {
+// Puts scores into slots side by side, which keep the greatest of all keys.
+inline CUDA_CALLABLE void put_into_slots(wp::int64* slots, const float* scores, int count, int width,
+                                         unsigned long long name) {
+    unsigned long long* const keys = (unsigned long long*)slots;
 #if defined(__CUDA_ARCH__)
-    // All loads before any atomic, so that they are under way together.
-    long long others[SCORES];
+    // All loads before any atomic, so that they are under way together; few go on to one.
+    unsigned long long others[SCORES];
 #pragma unroll
     for (int k = 0; k < SCORES; ++k)
-        others[k] = k < count ? __ldcg((const long long*)slots + k) : 0;
+        others[k] = k < count ? __ldcg(keys + k) : ~0ull;
 #pragma unroll
     for (int k = 0; k < SCORES; ++k) {
-        const long long key = make_slot_key(scores[k], place);
-        while (k < count && scores[k] > NO_SCORE && beats(key, others[k], list)) {
-            const long long before = (long long)atomicCAS((unsigned long long*)slots + k, (unsigned long long)others[k],
-                                                          (unsigned long long)key);
-            if (before == others[k])
-                break;
-            others[k] = before;
-        }
+        const unsigned long long key = make_slot_key(scores[k], width, name);
+        if (scores[k] > NO_SCORE && key > others[k])
+            atomicMax(keys + k, key);
     }
 #else
     for (int k = 0; k < count; ++k) {
-        const wp::int64 key = make_slot_key(scores[k], place);
-        if (scores[k] > NO_SCORE && beats(key, slots[k], list))
-            slots[k] = key;
+        const unsigned long long key = make_slot_key(scores[k], width, name);
+        if (scores[k] > NO_SCORE && key > keys[k])
+            keys[k] = key;
     }
 #endif
 }
@@ -108,10 +91,10 @@ inline CUDA_CALLABLE void put_into_slots(wp::int64* slots, const float* scores, 
 inline CUDA_CALLABLE void offer_point(wp::vec_t<3, wp::float32> normal, wp::vec_t<3, wp::float32> point,
                                       wp::float32 separation, wp::float32 weight,
                                       wp::array_t<wp::float32> directions, wp::int32 place, wp::int32 pair,
-                                      wp::array_t<wp::vec_t<3, wp::int32>> list, wp::array_t<wp::int64> slots) {
+                                      wp::array_t<wp::int64> slots) {
     typedef SlotScores<float, bool, int> Scores;
     Scores scores({normal[0], normal[1], normal[2]}, directions.data);
     scores.offer(weight, {point[0], point[1], point[2]}, separation, true);
     wp::int64* const slot = slots.data + (wp::int64)pair * SLOT_ROOM + SLOTS_A_BIN * (scores.bin / 9);
-    put_into_slots(slot, scores.score, SCORES, CROSSING_BIT | (unsigned int)place, list.data);
+    put_into_slots(slot, scores.score, SCORES, 32, place);
 }

@@ -149,7 +149,7 @@ class PointStage(Stage):
         self._sort_keys(count, 31)
         inputs = [*posed[:2], start, faces, contacts, of.order, curves]
         launch(loops.average_loop_kernel, -(-count // WARP_SIZE) * WARP_SIZE, inputs, WARP_SIZE)
-        inputs = [*posed, start, faces, of.order, contacts, curves, operator.hits, self._slots.slots]
+        inputs = [*posed, start, faces, of.order, contacts, curves, self._slots.slots]
         launch(manifold.offer_crossing_kernel, -(-count // WARP_SIZE) * WARP_SIZE, inputs)
 
     def _choose_points(self, given):

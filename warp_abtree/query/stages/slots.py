@@ -63,7 +63,7 @@ class SlotStage(Stage):
         """Return the slots, and what they keep."""
         return [
             Array(self.slots, "key", wp.int64, slots.SLOT_ROOM * rooms.pairs),
-            Array(self.slots, "measures", wp.vec2, rooms.pairs),
+            *fields(self.slots, rooms.pairs, measures=wp.vec2, widths=wp.vec2i),
             *fields(self.rows, rooms.pairs, start=wp.int32, count=wp.int32),
             Array(self.rows, "item", wp.vec3i, self.room(rooms)),
         ]
@@ -87,5 +87,5 @@ class SlotStage(Stage):
     def list_witnesses(self):
         """List the witnesses, after what crosses was offered. Launches only."""
         operator = self.operator
-        inputs = [operator.pair_batch, self.slots, operator.hits, self.rows]
+        inputs = [operator.pair_batch, self.slots, self.rows]
         operator.launch_warps(slots.list_witness_kernel, operator.rooms.pairs, inputs)
