@@ -39,10 +39,12 @@ class Buffers:
     """Room of a query's lists; None is a guess. `run()` makes more room, `launch()` cannot.
 
     Attributes:
-        hits: Intersecting face pairs, where they are listed.
+        hits: Intersecting face pairs, where they are listed; of a `ManifoldQuery` also witnesses, at most 380 an object
+            pair.
         pairs: Object pairs; by default those given, or a guess for the broad phase.
-        uncertain: Face pairs between float32 and the later stages, and with a gap as many that are apart; not needed on
-            the CPU.
+        uncertain: Face pairs between float32 and the later stages, and with a gap as many that are apart. Of a
+            `ManifoldQuery` with a gap, face pairs that may be near, on the CPU too; those between stages have a
+            quarter of it. Else not needed on the CPU.
 
     Raises:
         ValueError: A number that is out of range.

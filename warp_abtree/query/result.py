@@ -92,7 +92,8 @@ class Result(DeviceMemory):
     Attributes:
         pairs: Object pairs queried, int32 (p, 2).
         any: Whether each pair intersects, bool (p,).
-        count: Intersecting face pairs of each, with a gap those nearer than that too, int64 (p,); None for "any".
+        count: Intersecting face pairs of each, with a gap those nearer than that too, except from a `ManifoldQuery`,
+            int64 (p,); None for "any".
         faces: (pair, face of the pair's first object, face of its second), int32 (k, 3), sorted; None unless output
             is "faces" or "contacts".
         contacts, pair_contacts: Structured arrays (k,) and (p,), see `query.stages.contacts`; None unless

@@ -1,46 +1,43 @@
-"""Contact points: the contacts of an object pair reduced to a few points that a solver can push on; `ManifoldQuery`.
+"""Contact points: the contacts of each object pair reduced to a few points that a solver can push on; `ManifoldQuery`.
 
-Meshes meet in curves, and a curve alone has no depth. Here is what is made of it, for each object pair:
+Face pairs are offered to slots by normal and direction (`kernels.contacts.slots`), which keep 380 witnesses an object
+pair at most, whatever the order of offers. Faces that cross are found exactly and have contacts
+(`query.stages.contacts`); their candidate points are measured in float64 before the offer. With `gap=d` faces that are
+apart but nearer are offered in float32; the winners are measured in float64, and dropped if they are not nearer than d.
 
-* Contacts that share a face of either object form a loop, unless their other faces are two walls that face each other:
-  what jams in a slot has a loop at either wall. The normal of a loop is the direction of the area vector of
-  its curve, 1/2 sum p x dp: the volume that two closed surfaces share shrinks by that vector times a motion, so it is
-  the way out, for edges against edges and for corners too, and it needs the curve alone. A curve without area gives way
-  to the mean of its contacts' normals.
-* A contact's depth is how far the one face lies behind the other's plane within the column of that face along the
-  normal, at the deepest place. Where the normal of either face is within 60 degrees of the loop's and makes that
-  depth no larger, it takes the place of the loop's: so a box in a corner is pushed by floor and wall, each its own way.
-  So does that of either face, however it looks, where neither is within 60 degrees of the loop's and one looks the
-  other way: a contact loop over both flanks of a screw thread has no single separating direction.
-* Of all candidates of the pair an outermost one is taken, then those farthest, in place and in normal, from the
-  segments between those before, and the deepest, up to 8 of them or as many as asked for, in the order in which they
-  lie along a fixed direction of the lower object: points that stay keep their order from launch to launch.
+* Crossing contacts that share a face of either object form a loop, unless their other faces are two walls that face
+  each other: what jams in a slot has a loop at either wall. The normal of a loop is that of the area vector of its
+  curve, (1/2) sum p x dp: the volume that two closed surfaces share shrinks by that vector times a motion, so it is the
+  way out, for edges and corners too. Without area it is the mean of the contacts' normals.
+* Their depth is how far the one face lies behind the other's plane within the column of that face along the normal, at
+  each corner there. Where the normal of either face is within 60 degrees of the loop's and makes the depth no larger,
+  it takes the place of the loop's: so a box in a corner is pushed by floor and wall, each its own way. So does that of
+  either face where neither is and one looks the other way: a contact loop over both flanks of a screw thread has no
+  single separating direction.
+* Faces that are apart have minus a separation as depth (`kernels.contacts.near_points`). Where they look at one another
+  within 60 degrees all corners within the column count, along whichever normal leaves the wider gap, if that is the
+  distance; else, as across edges, the middle of the nearest points. A face behind the other's plane is inside, as deep
+  as it is far.
+* Edges and what is inside count only if a tree search finds no other face nearer. Contacts at edges that nearer faces
+  cover are left out on purpose: edges between the faces of a floor would stop what slides past.
 
-With `gap=d` faces that are apart but nearer than d have candidates too, with minus a separation as depth. Where two
-faces look at one another within 60 degrees it is measured along the normal that leaves the wider gap: the nearest point
-of the one face's part within the column of the other, and one far from it. Where their distance is in another
-direction, as across two edges, it is their nearest points. A face behind the other's plane is inside, as deep as it is
-far: so what lies up to d inside is not forgotten once it no longer crosses. Across edges and inside, points count only
-if no other face of either object is nearer to them: so a box that slides over a floor of many faces is not stopped by
-the edges between them. Depths count from the gap on for what is half as deep as what.
+Points are chosen in float32 (`kernels.contacts.points`): the candidate that the most violated of 256 twists takes
+deepest, until none is violated by more than 2^-10 of the motion, 2 (gap + depth) + size / 256. The deepest, or one
+nearly as deep, is among them. They lie in order along a fixed direction of the lower object, so that those that stay
+keep their order.
 
 Normals come from the winding of the faces, outwards. Depth is exact while every vertex inside has a face that crosses;
 once a whole ring of faces is inside it is that ring's, too little, and without a gap an object that lies whole inside
-another has no points. Solids (`Scene.add`) have more. Of an object pair that intersects, of which one is a solid:
+another has no points. Solids (`Scene.add`) have more: where the pair intersects, corners of one object inside the
+other, a solid, that are deeper than all other points by 1/4096 of the smaller object's size (the diagonal of its box)
+have their distance from its surface as depth, and the way there as normal. A pair whose points are all less deep than
+that is passed over. Up to four become points, the deepest first, a quarter of that size apart and at least half as deep
+as the first, in the places of the nearest others if there is no room. Their ways out are within 90 degrees of the sum
+of the other points' normals; of what lies inside whole, of the way out of the middle of its box: they do not hold an
+object from both sides. Of two thin surfaces that are through each other the way out is as likely forwards as back.
 
-* Corners of one object inside the other, a solid, have as depth their distance from its surface, and the way there as
-  normal. Up to four become points, the deepest first, a quarter of the smaller object's size (the diagonal of its box)
-  from one another and at least half as deep as the first, and take the places of the nearest others if there is no
-  room.
-* They are looked for where they are needed: only corners that are deeper than all other points of the pair by 1/4096 of
-  that size count, and pairs whose points are all less deep than that are passed over.
-* Their ways out are within 90 degrees of the sum of the other points' normals; of what lies inside whole, of the way
-  out of the middle of its box. So they do not hold an object from both sides.
-
-Of two thin surfaces that are through each other the way out is as likely forwards as back.
-
-Source of the area vector as a gradient: Allard et al. 2010, Volume Contact Constraints at Arbitrary Resolution,
-section 3; that the boundary curve gives it is Stokes' theorem.
+Source of the area vector as a gradient: Allard et al. 2010, Volume Contact Constraints at Arbitrary Resolution, section
+3; that the boundary curve gives it is Stokes' theorem.
 """
 
 from typing import Any
@@ -189,16 +186,24 @@ class PointStage(Stage):
 
 
 class ManifoldQuery(Operator):
-    """Contact points of many object pairs as an operator: `ContactQuery`, then the points of each pair.
+    """Contact points of many object pairs as an operator, see this module's docstring.
 
     Pairs of the broad phase are sorted by their objects, so that nothing depends on the order in which it found them.
 
     Args:
-        scene, pairs, capacity, precision, gap: As for `ContactQuery`.
-        points: Most points of a pair, 1 to 64. Those beyond the eighth lie farthest from any before them.
+        scene, pairs, precision, gap: As for `ContactQuery`.
+        capacity: `Buffers`, or the hits that there is room for: contacts of faces that cross, and witnesses.
+        points: Most points of a pair, 1 to 64. A pair has fewer where these hold against all twists.
 
     Attributes:
         manifolds: Points of each pair, device arrays (pair capacity, points) of `kernels.contacts.manifold.Manifolds`.
+        contacts: Contacts of faces that cross, as of `ContactQuery`, without separations; faces and start as there.
+        curves: Loops of these contacts, device arrays (capacity,) of `kernels.contacts.manifold.Curves`.
+        witness_rows: Face pairs that the slots of each pair keep, those of pair p at start[p] to start[p] + count[p],
+            of `kernels.contacts.slots.WitnessRows`; an item that begins with -1 is none.
+        witnesses: Normals and candidate points of these, `kernels.contacts.manifold.Witnesses`, in the same places.
+        near_contacts: Contacts of those that are apart, with separations, in the same places; other places hold
+            nothing. Empty without a gap.
         point_max: Most points of a pair.
     """
 
