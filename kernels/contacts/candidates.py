@@ -15,7 +15,8 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.nodes import store_entry
-from warp_abtree.kernels.contacts.manifold import COLUMN_CORNERS, NO_DEPTH, Witnesses
+from warp_abtree.kernels.contacts.column import COLUMN_CORNERS, NO_DEPTH
+from warp_abtree.kernels.contacts.manifold import Witnesses
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -11,17 +11,9 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, Trees
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
+from warp_abtree.kernels.contacts.column import COLUMN_CORNERS, NO_DEPTH, column_slack, load_pair, measure_column
 from warp_abtree.kernels.contacts.contact import Contacts, contact_objects
-from warp_abtree.kernels.contacts.manifold import (
-    COLUMN_CORNERS,
-    NO_DEPTH,
-    NO_POINT,
-    Witnesses,
-    column_slack,
-    load_pair,
-    measure_column,
-    write_candidates,
-)
+from warp_abtree.kernels.contacts.manifold import NO_POINT, Witnesses, write_candidates
 from warp_abtree.kernels.contacts.separation import write_near_contact
 from warp_abtree.kernels.contacts.slots import WitnessRows
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK, Hits

@@ -17,7 +17,8 @@ from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.nodes import load_entry
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.contacts.candidates import ObjectPose, group_lane, group_size, list_candidates
-from warp_abtree.kernels.contacts.manifold import COLUMN_CORNERS, NO_DEPTH, Manifolds, Witnesses
+from warp_abtree.kernels.contacts.column import COLUMN_CORNERS, NO_DEPTH
+from warp_abtree.kernels.contacts.manifold import Manifolds, Witnesses
 from warp_abtree.kernels.contacts.slots import WitnessRows
 
 TWIST_COUNT, RANDOM_TWISTS = native.constant("TWIST_COUNT"), native.constant("RANDOM_TWISTS")

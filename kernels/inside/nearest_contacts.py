@@ -5,8 +5,9 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import PairBatch
+from warp_abtree.kernels.contacts.column import COLUMN_CORNERS
 from warp_abtree.kernels.contacts.contact import Contacts
-from warp_abtree.kernels.contacts.manifold import COLUMN_CORNERS, NO_POINT, Witnesses
+from warp_abtree.kernels.contacts.manifold import NO_POINT, Witnesses
 from warp_abtree.kernels.contacts.slots import WitnessRows
 from warp_abtree.kernels.distance.frame import make_scale
 from warp_abtree.kernels.inside.nearest_face import make_solid, nearest_face

@@ -11,7 +11,7 @@ A key in a pair's segment, the same as that of `sort_by_pair`:
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.contacts.chunks import chunk_span, first_chunk
+from warp_abtree.kernels.contacts.summary import chunk_span, first_chunk
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK
 from warp_abtree.kernels.io.sort_hits import count_rows
 

@@ -11,7 +11,7 @@ from helpers.samples import STILL, contact_poses, sample
 import warp_abtree as ab
 from warp_abtree import testing
 from warp_abtree.kernels import native
-from warp_abtree.kernels.contacts.chunks import locate_chunk_kernel
+from warp_abtree.kernels.contacts.summary import locate_chunk_kernel
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 from warp_abtree.kernels.io.sort_segments import SEGMENT_KEYS, SEGMENT_THREADS
 from warp_abtree.kernels.triangle.segment import divide_vector

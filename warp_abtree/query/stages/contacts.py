@@ -68,7 +68,7 @@ import warp as wp
 
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.base.lanes import WARP_SIZE
-from warp_abtree.kernels.contacts import chunks, contact, separation, simd, summary
+from warp_abtree.kernels.contacts import contact, separation, simd, summary
 from warp_abtree.kernels.io import contact_results as pack
 from warp_abtree.kernels.io import sort_hits
 from warp_abtree.query.operator import Operator
@@ -163,7 +163,7 @@ class ContactStage(Stage):
     @staticmethod
     def _chunk_count(places: int, pairs: int) -> int:
         """Return how many chunks there may be: `first_chunk` of the pair after the last, if all places are taken."""
-        return places // int(chunks.CHUNK) + pairs
+        return places // int(summary.CHUNK) + pairs
 
     def places(self, count: int | None) -> int:
         """Return how many places to look at of so many hits; None: all there are."""
@@ -190,7 +190,7 @@ class ContactStage(Stage):
             self._listed_totals.zero_()
         if not self.sort.launch(count, self.order, self.key, self.faces, ends=ends):
             inputs = [self.start, self._sums.span]
-            operator.launch_kernel(chunks.locate_chunk_kernel, self._chunk_count(count, operator.rooms.pairs), inputs)
+            operator.launch_kernel(summary.locate_chunk_kernel, self._chunk_count(count, operator.rooms.pairs), inputs)
 
     def _find(self, count: int):
         operator, launch, contacts = self.operator, self.operator.launch_kernel, self.contacts

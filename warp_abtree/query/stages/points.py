@@ -47,7 +47,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.kernels.base.lanes import WARP_SIZE
-from warp_abtree.kernels.contacts import contact, loops, manifold, near_points
+from warp_abtree.kernels.contacts import column, contact, loops, manifold, near_points
 from warp_abtree.kernels.contacts import points as point_kernels
 from warp_abtree.kernels.inside import inside_points, nearest_contacts
 from warp_abtree.query.operator import Operator
@@ -58,7 +58,7 @@ from warp_abtree.query.stages.slots import SlotStage
 from warp_abtree.query.staging import first_rows
 
 POINTS_MAX = int(manifold.POINTS)
-CANDIDATES = int(manifold.COLUMN_CORNERS)
+CANDIDATES = int(column.COLUMN_CORNERS)
 POINT_FIELDS = {"point": wp.vec3d, "normal": wp.vec3d, "depth": wp.float64}
 
 
