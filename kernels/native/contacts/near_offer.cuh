@@ -75,7 +75,8 @@ struct NearOffer {
         // Along a normal, or so near that normals tell the direction.
         const lanes most = N::most(F::absolute(ahead_a), F::absolute(ahead_b));
         const bits touches = distance <= size * 0x1p-20f, column = facing & (touches | (most >= distance * 0.99f));
-        const bits along = column | touches, inside = column & (distance > size * 0x1p-20f) & (ahead_a < 0.0f) & (ahead_b < 0.0f);
+        const bits along = column | touches,
+                   inside = column & (distance > size * 0x1p-20f) & (ahead_a < 0.0f) & (ahead_b < 0.0f);
         const lanes separation = inside ? -distance : distance, least = distance * 0x1p-6f;
         // What lies deeper inside than its distance is not measured by it (`near_points`).
         lanes lowest = zero;
@@ -98,7 +99,8 @@ struct NearOffer {
         scores.offer(weight, vector_of(N::add(joined.at, zero + 0.5f, joined.way)), rank, counts);
         for (int k = 0; k < 6; ++k) {
             const bits near = (joined.height[k] <= gap) & (joined.height[k] >= -gap);
-            scores.offer(weight, vector_of(joined.corner[k]), joined.height[k], counts & column & (separation >= 0.0f) & near);
+            scores.offer(weight, vector_of(joined.corner[k]), joined.height[k],
+                         counts & column & (separation >= 0.0f) & near);
         }
         return scores;
     }

@@ -5,10 +5,10 @@
 #include "distance/corners32.h"
 
 template <class ModelPool, class StatePool, class PairPose>
-void simd_offer_list(const ModelPool& models, const StatePool& states, wp::array_t<PairPose> pair_poses, wp::int32 count,
-                     wp::array_t<wp::vec_t<3, wp::int32>> list, wp::array_t<wp::vec_t<2, wp::float32>> measures,
-                     wp::array_t<wp::float32> directions, wp::array_t<wp::vec_t<2, wp::int32>> widths,
-                     wp::array_t<wp::int64> slots) {
+void simd_offer_list(const ModelPool& models, const StatePool& states, wp::array_t<PairPose> pair_poses,
+                     wp::int32 count, wp::array_t<wp::vec_t<3, wp::int32>> list,
+                     wp::array_t<wp::vec_t<2, wp::float32>> measures, wp::array_t<wp::float32> directions,
+                     wp::array_t<wp::vec_t<2, wp::int32>> widths, wp::array_t<wp::int64> slots) {
     typedef NearOffer O;
     for (int first = 0, some; first < count; first += some) {
         const int pair = list.data[first][0];

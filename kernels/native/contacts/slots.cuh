@@ -43,8 +43,8 @@ struct SlotScores {
     CUDA_CALLABLE void offer(float weight, const Vector& point, const L& separation, const B& counts) {
         const L x = dot(across[0], point) * weight, y = dot(across[1], point) * weight, depth = -separation;
         const L sum = (x + y) * 0.70710678f, difference = (x - y) * 0.70710678f, none = L{} + NO_SCORE;
-        const L along[SCORES] = {depth,     depth + x,   depth - x,          depth + y,         depth - y,
-                                      depth + sum, depth - sum, depth + difference, depth - difference};
+        const L along[SCORES] = {depth,       depth + x,   depth - x,          depth + y,         depth - y,
+                                 depth + sum, depth - sum, depth + difference, depth - difference};
         for (int k = 0; k < SCORES; ++k) {
             const L found = counts ? along[k] : none;
             score[k] = found > score[k] ? found : score[k];
@@ -89,9 +89,8 @@ inline CUDA_CALLABLE void put_into_slots(wp::int64* slots, const float* scores, 
 }
 
 inline CUDA_CALLABLE void offer_point(wp::vec_t<3, wp::float32> normal, wp::vec_t<3, wp::float32> point,
-                                      wp::float32 separation, wp::float32 weight,
-                                      wp::array_t<wp::float32> directions, wp::int32 place, wp::int32 pair,
-                                      wp::array_t<wp::int64> slots) {
+                                      wp::float32 separation, wp::float32 weight, wp::array_t<wp::float32> directions,
+                                      wp::int32 place, wp::int32 pair, wp::array_t<wp::int64> slots) {
     typedef SlotScores<float, bool, int> Scores;
     Scores scores({normal[0], normal[1], normal[2]}, directions.data);
     scores.offer(weight, {point[0], point[1], point[2]}, separation, true);

@@ -27,8 +27,8 @@ struct TwistChoice {
 #endif
     struct Twists {
         Point linear, angular;
-        lanes stop;         // part of the motion that the points chosen allow
-        lanes worst;        // how deep it takes a candidate then
+        lanes stop;          // part of the motion that the points chosen allow
+        lanes worst;         // how deep it takes a candidate then
         integers candidate;  // the first that goes so deep
     };
     // A candidate: normal, separation; moment of the normal, and its number.
@@ -61,10 +61,17 @@ struct TwistChoice {
     // Turns about a line across a normal, at the rim of the candidates in a direction: what only the outermost of them
     // stop. The first two components of a twist are the direction's, along two vectors across the normal.
     CUDA_CALLABLE void tilt(Twists& t, const float (&n)[3]) const {
-        const int least = fabsf(n[0]) <= fabsf(n[1]) ? (fabsf(n[0]) <= fabsf(n[2]) ? 0 : 2)
-                                                     : (fabsf(n[1]) <= fabsf(n[2]) ? 1 : 2);
-        float u[3] = {least == 0 ? 0.0f : least == 1 ? -n[2] : n[1], least == 0 ? n[2] : least == 1 ? 0.0f : -n[0],
-                      least == 0 ? -n[1] : least == 1 ? n[0] : 0.0f};
+        const int least =
+            fabsf(n[0]) <= fabsf(n[1]) ? (fabsf(n[0]) <= fabsf(n[2]) ? 0 : 2) : (fabsf(n[1]) <= fabsf(n[2]) ? 1 : 2);
+        float u[3] = {least == 0   ? 0.0f
+                      : least == 1 ? -n[2]
+                                   : n[1],
+                      least == 0   ? n[2]
+                      : least == 1 ? 0.0f
+                                   : -n[0],
+                      least == 0   ? -n[1]
+                      : least == 1 ? n[0]
+                                   : 0.0f};
         const float length = sqrtf(u[0] * u[0] + u[1] * u[1] + u[2] * u[2]);
         for (int k = 0; k < 3; ++k)
             u[k] = length > 0.0f ? u[k] / length : 0.0f;
