@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.poses import HALF, PairBatch
-from warp_abtree.kernels.intersect.face_pairs import Hits, count_witnesses
+from warp_abtree.kernels.intersect.face_pairs import Hits, read_total
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -75,7 +75,7 @@ def judge_contacts_kernel(batch: PairBatch, hits: Hits, bodies_out: Bodies):
     """Note whether a query found all contacts within its capacity; one thread."""
     whole = batch.launched[0] >= 0 and wp.uint32(batch.count[0]) <= wp.uint32(batch.pairs.shape[0])
     whole = whole and wp.uint32(hits.total[0]) <= wp.uint32(hits.face.shape[0])
-    whole = whole and count_witnesses(hits) <= wp.int64(hits.face.shape[0])
+    whole = whole and read_total(hits.witness_total) <= wp.int64(hits.face.shape[0])
     if hits.uncertain.shape[0] > 0:
         whole = whole and wp.uint32(hits.uncertain_total[0]) <= wp.uint32(hits.uncertain.shape[0])
     if hits.apart.shape[0] > 0:

@@ -17,7 +17,7 @@ from warp_abtree.kernels.contacts.column import (
     measure_column,
 )
 from warp_abtree.kernels.contacts.contact import Contacts
-from warp_abtree.kernels.contacts.slots import Slots, WitnessRows, offer_point, scattered_place
+from warp_abtree.kernels.contacts.slots import Slots, WitnessRows, offer_point
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 
 wp.set_module_options(native.options("contacts/slots.cuh"))
@@ -193,11 +193,9 @@ def offer_crossing_kernel(
             at all.
         start, faces, order: Contacts of pairs, as for `loops`, in the order of loops.
     """
-    count = start[start.shape[0] - 1]
-    at = scattered_place(wp.tid(), count)
-    if at >= count:
+    if wp.tid() >= start[start.shape[0] - 1]:
         return
-    i = order[at]
+    i = order[wp.tid()]
     crossing = load_crossing(i, batch, gap, faces[i], contacts)
     p = faces[i][0]
     pose = batch.poses[p]

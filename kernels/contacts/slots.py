@@ -36,8 +36,6 @@ wp.set_module_options(native.options("base/lanes.cuh", "contacts/near_offer.cuh"
 NORMAL_BINS, SCORES = native.constant("NORMAL_BINS"), native.constant("SCORES")
 SLOTS_A_BIN, SLOT_ROOM = native.constant("SLOTS_A_BIN"), native.constant("SLOT_ROOM")
 ALL_SLOTS = wp.constant(wp.int64(SLOT_ROOM))
-# Items side by side that are offered together, and a prime beyond any number of them.
-SCATTERED, SCATTERING = wp.constant(32), wp.constant(wp.int64(2**31 - 1))
 # Directions count so much at least, where gaps are tiny.
 WEIGHT_LEAST = wp.constant(wp.float64(2.0**-8))
 
@@ -138,31 +136,18 @@ def start_slots_kernel(
     if i == 0:
         hits_out.witness_total[0] = 0
     if i == p * SLOT_ROOM and p < batch.count[0] and p < batch.pairs.shape[0]:
-        shell, one = wp.float64(0.0), wp.float64(1.0)
+        shell = wp.float64(0.0)
         if gap.shape[0] > 0:
             shell = gap[p]
         a, b = trees.objects.state[batch.pairs[p][0]], trees.objects.state[batch.pairs[p][1]]
         size = wp.min(tree_size(trees, a), tree_size(trees, b))
         weight = WEIGHT_LEAST
         if shell > WEIGHT_LEAST * size:
-            weight = wp.min(shell, size) / wp.max(size, wp.min(shell, size))
+            weight = wp.where(shell < size, shell / size, wp.float64(1.0))
         swapped = batch.poses[p].swapped != 0
         of_a, of_b = count_bits(trees, wp.where(swapped, b, a)), count_bits(trees, wp.where(swapped, a, b))
         slots_out.widths[p] = wp.vec2i(of_a, of_b)
-        slots_out.measures[p] = wp.vec2(wp.float32(shell * batch.poses[p].scale), wp.float32(wp.min(weight, one)))
-
-
-@wp.func
-def scattered_place(i: wp.int32, count: wp.int32):
-    """Return which of so many items thread i offers, `count` or more for none; threads beyond the count have some too.
-
-    In the order of the lists places move steadily, and half of all offers would go beyond those before them.
-    """
-    chunks = (count + SCATTERED - 1) / SCATTERED
-    at = wp.int32(count)
-    if i < SCATTERED * chunks:
-        at = SCATTERED * wp.int32(wp.int64(i / SCATTERED) * SCATTERING % wp.int64(chunks)) + i % SCATTERED
-    return at
+        slots_out.measures[p] = wp.vec2(wp.float32(shell * batch.poses[p].scale), wp.float32(weight))
 
 
 @wp.kernel
@@ -170,18 +155,15 @@ def offer_near_kernel(step: wp.int32, trees: Trees, batch: PairBatch, hits: Hits
     """Offer the face pairs that are listed as apart to the slots of their object pairs, in a grid-stride loop."""
     i = wp.tid()
     end = wp.int32(wp.min(wp.uint32(hits.apart_total[0]), wp.uint32(hits.apart.shape[0])))
-    while i < end + SCATTERED:
-        at = scattered_place(i, end)
-        i += step
-        if at >= end:
-            continue
-        row = hits.apart[at]
+    while i < end:
+        row = hits.apart[i]
         pose = batch.poses[row[0]]
         scale = wp.float32(pose.scale)
         a, b = load_points(trees, pose, pose.translation32 * scale, scale, row[1], row[2])
         measures, widths = slots_inout.measures[row[0]], slots_inout.widths[row[0]]
         directions = slots_inout.directions
         offer_faces(a, b, measures[0], measures[1], directions, widths, row[1], row[2], row[0], slots_inout.key)
+        i += step
 
 
 @wp.kernel

@@ -206,18 +206,9 @@ def report_hit(slot: wp.int32, pair: wp.int32, swapped: wp.int32, face_a: wp.int
 
 
 @wp.func
-def count_witnesses(hits: Hits):
-    """Return how many rows face pairs are reduced to, as `count_apart`."""
+def read_total(total: wp.array(dtype=wp.int32)):
+    """Return a counter of rows, [1] or [0] for none, read as uint32: an overflowed one still tells the demand."""
     count = wp.int64(0)
-    if hits.witness_total.shape[0] > 0:
-        count = wp.int64(wp.uint32(hits.witness_total[0]))
-    return count
-
-
-@wp.func
-def count_apart(hits: Hits):
-    """Return how many face pairs are listed as apart, read as uint32: an overflowed counter still tells the demand."""
-    count = wp.int64(0)
-    if hits.gap.shape[0] > 0:
-        count = wp.int64(wp.uint32(hits.apart_total[0]))
+    if total.shape[0] > 0:
+        count = wp.int64(wp.uint32(total[0]))
     return count

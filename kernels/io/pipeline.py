@@ -5,7 +5,7 @@ import warp as wp
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.generation import LaunchRecord, record_launch
 from warp_abtree.kernels.base.poses import PairBatch, rotate_quaternion
-from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart
+from warp_abtree.kernels.intersect.face_pairs import Hits, read_total
 from warp_abtree.kernels.io.place_poses import is_quaternion_pose, read_position, read_quaternion
 from warp_abtree.kernels.update.work_lists import note_fault
 
@@ -53,5 +53,5 @@ def tally_demand_kernel(batch: PairBatch, hits: Hits, demand_inout: wp.array(dty
     demand_inout[1] = wp.max(demand_inout[1], wp.int64(wp.uint32(hits.total[0])))
     demand_inout[2] = wp.max(demand_inout[2], wp.int64(wp.uint32(hits.uncertain_total[0])))
     if hits.apart.shape[0] > 0:
-        demand_inout[2] = wp.max(demand_inout[2], count_apart(hits))
+        demand_inout[2] = wp.max(demand_inout[2], read_total(hits.apart_total))
     demand_inout[3] = wp.max(demand_inout[3], wp.int64(batch.launched[1]))

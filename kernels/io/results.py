@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.poses import PairBatch
-from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart, count_witnesses
+from warp_abtree.kernels.intersect.face_pairs import Hits, read_total
 
 wp.set_module_options(native.options())
 
@@ -54,8 +54,8 @@ def pack_pair_kernel(
     if i == 0:
         words_inout[0] = wp.int64(batch.launched[0])
         words_inout[1] = wp.int64(batch.count[0])
-        words_inout[4] = count_apart(hits)
-        words_inout[5] = count_witnesses(hits)
+        words_inout[4] = read_total(hits.apart_total)
+        words_inout[5] = read_total(hits.witness_total)
     if i < n:
         words_inout[HEADER_WORDS + i] = hit_count
         words_inout[HEADER_WORDS + n + i] = hits.node_tests[i]

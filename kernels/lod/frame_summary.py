@@ -5,7 +5,7 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.counters import add_lanes
 from warp_abtree.kernels.base.poses import PairBatch
-from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart, count_witnesses
+from warp_abtree.kernels.intersect.face_pairs import Hits, read_total
 
 wp.set_module_options(native.options("base/counters.cuh"))
 
@@ -74,7 +74,7 @@ def summarise_frame_kernel(
         summary_out[wp.static(FRAMES)] = frames_inout[0]
         summary_out[wp.static(LAUNCHED)] = wp.int64(batch.launched[0])
         summary_out[wp.static(PAIRS)] = wp.int64(batch.count[0])
-        summary_out[wp.static(APART)] = count_apart(hits)
-        summary_out[wp.static(WITNESSES)] = count_witnesses(hits)
+        summary_out[wp.static(APART)] = read_total(hits.apart_total)
+        summary_out[wp.static(WITNESSES)] = read_total(hits.witness_total)
         summary_out[wp.static(CHANGED)] = wp.int64(changed[0])
         summary_out[wp.static(TURNED)] = wp.int64(changed[1])

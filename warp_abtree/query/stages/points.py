@@ -147,7 +147,7 @@ class PointStage(Stage):
         inputs = [*posed[:2], start, faces, contacts, of.order, curves]
         launch(loops.average_loop_kernel, -(-count // WARP_SIZE) * WARP_SIZE, inputs, WARP_SIZE)
         inputs = [*posed, start, faces, of.order, contacts, curves, self._slots.slots]
-        launch(manifold.offer_crossing_kernel, -(-count // WARP_SIZE) * WARP_SIZE, inputs)
+        launch(manifold.offer_crossing_kernel, count, inputs)
 
     def _choose_points(self, given):
         """Choose the points of each pair. Launches only."""
