@@ -82,15 +82,15 @@ def deepest_of(first: wp.int32, end: wp.int32, witnesses: Witnesses):
 
 
 @wp.func
-def list_wrenches(contacts: wp.vec2i, lowest: wp.float64, pose: ObjectPose, found: Candidates, witnesses: Witnesses):
+def list_wrenches(span: wp.vec2i, lowest: wp.float64, pose: ObjectPose, found: Candidates, witnesses: Witnesses):
     """List the wrenches of a pair's candidates in the order of their numbers, and return where they end."""
     back, zero, one = wp.transpose(pose.rotation), wp.float64(0.0), wp.float64(1.0)
     deepest = wp.max(found.deepest, zero)
     scale = wp.where(found.size > zero, one / found.size, zero)
-    end, base = wp.int32(found.first), COLUMN_CORNERS * contacts[0]
-    while base < COLUMN_CORNERS * contacts[1]:
+    end, base = wp.int32(found.first), COLUMN_CORNERS * span[0]
+    while base < COLUMN_CORNERS * span[1]:
         number = base + group_lane()
-        lists = number < COLUMN_CORNERS * contacts[1]
+        lists = number < COLUMN_CORNERS * span[1]
         if lists:
             lists = has_candidate(number, lowest, witnesses)
         place = next_place_of_group(end, lists)
@@ -110,15 +110,15 @@ def list_wrenches(contacts: wp.vec2i, lowest: wp.float64, pose: ObjectPose, foun
 
 
 @wp.func
-def list_candidates(contacts: wp.vec2i, shell: wp.float64, pose: ObjectPose, witnesses: Witnesses):
+def list_candidates(span: wp.vec2i, shell: wp.float64, pose: ObjectPose, witnesses: Witnesses):
     """List the candidates of a pair, deeper than minus its gap; middles of contacts where no face has a depth.
 
     Args:
-        contacts: Where the pair's contacts begin and end.
+        span: Where the pair's witnesses begin and end.
         shell: The gap.
     """
     found = Candidates()
-    first, end = COLUMN_CORNERS * contacts[0], COLUMN_CORNERS * contacts[1]
+    first, end = COLUMN_CORNERS * span[0], COLUMN_CORNERS * span[1]
     found.first = first
     found.deepest = deepest_of(first, end, witnesses)
     lowest = wp.where(found.deepest == NO_DEPTH, NO_DEPTH, -shell)
@@ -137,5 +137,5 @@ def list_candidates(contacts: wp.vec2i, shell: wp.float64, pose: ObjectPose, wit
         high[k] = greatest_of_group(high[k])
     found.middle = wp.float64(0.5) * (high - low)
     found.size = wp.float64(0.5) * wp.length(high + low)
-    found.end = list_wrenches(contacts, lowest, pose, found, witnesses)
+    found.end = list_wrenches(span, lowest, pose, found, witnesses)
     return found

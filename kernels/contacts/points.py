@@ -126,8 +126,8 @@ def point_chooser(most: int):
             gap: Of each pair [world units], or [0] for none.
         """
         p = wp.tid() / group_size()
-        contacts = wp.vec2i(rows.start[p], rows.start[p] + rows.count[p])
-        if contacts[0] >= contacts[1]:
+        span = wp.vec2i(rows.start[p], rows.start[p] + rows.count[p])
+        if span[0] >= span[1]:
             if group_lane() == 0:
                 manifolds_out.count[p] = 0
             return
@@ -139,7 +139,7 @@ def point_chooser(most: int):
         pose.rotation = objects.rotation[a]
         pose.position = objects.position[a]
         pose.sense = wp.where(batch.pairs[p][0] == a, wp.float64(1.0), wp.float64(-1.0))
-        found = list_candidates(contacts, shell, pose, witnesses_inout)
+        found = list_candidates(span, shell, pose, witnesses_inout)
         chosen = wp.zeros(shape=(wp.static(most),), dtype=wp.int32)
         count = wp.int32(0)
         if found.first < found.end:
