@@ -1,6 +1,8 @@
 """Results: packed, brought over or left on the device, by any device and number of threads, the same bits."""
 
 import gc
+import threading
+import weakref
 from functools import partial
 
 import numpy as np
@@ -13,7 +15,7 @@ from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.checks.cpu_threads import cores_for, launch_on_cores
+from warp_abtree.checks.cpu_threads import cores_for, launch_on_cores, workers
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.counters import take_slots
 from warp_abtree.query.result import COUNTERS
@@ -390,3 +392,16 @@ def test_threads_take_every_item_once_and_raise_what_fails():
         assert (seen.numpy() == 1).all() and 1 <= taken.numpy()[0] - count <= min(threads, count)
     with pytest.raises(Exception, match="'seen'"):
         launch_on_cores(partial(wp.launch, count_item_kernel, 1, [100, taken, 3.5], device="cpu"), 2)
+
+
+def test_a_busy_thread_keeps_no_launch_that_ended_without_it():
+    go_on, items = threading.Event(), np.zeros(1)
+    busy, kept = workers(1).submit(go_on.wait), weakref.ref(items)
+    try:
+        launch_on_cores(partial(items.fill, 1), 2)
+        del items
+        gc.collect()
+        assert kept() is None
+    finally:
+        go_on.set()
+        busy.result()

@@ -69,6 +69,7 @@ class _Share:
                         self._changed.wait()
             except BaseException as error:
                 interruption = error
+        self._launch = None  # a busy thread that comes later must not keep its arrays until then
         if interruption is not None:
             raise interruption
 
