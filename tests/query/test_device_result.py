@@ -1,9 +1,6 @@
 """Results: packed, brought over or left on the device, by any device and number of threads, the same bits."""
 
 import gc
-import threading
-import weakref
-from functools import partial
 
 import numpy as np
 import pytest
@@ -15,9 +12,6 @@ from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.checks.cpu_threads import cores_for, launch_on_cores, workers
-from warp_abtree.kernels import native
-from warp_abtree.kernels.base.counters import take_slots
 from warp_abtree.query.result import COUNTERS
 from warp_abtree.query.staging import BLOCK_LEAST, LENT_MAX, PINNED_AT_ONCE, HostPool
 
@@ -373,35 +367,3 @@ def test_a_capture_records_all_threads():
     query.hits.face.fill_(0)
     wp.capture_launch(capture.graph)
     np.testing.assert_array_equal(query.result().faces, expected)
-
-
-@wp.kernel(module="unique", module_options=native.options("base/counters.cuh"))
-def count_item_kernel(count: int, taken: wp.array[int], seen: wp.array[int]):
-    i = take_slots(taken, 1)
-    while i < count:
-        seen[i] = seen[i] + 1
-        i = take_slots(taken, 1)
-
-
-def test_threads_take_every_item_once_and_raise_what_fails():
-    for threads, count in ((1, 17), (2, 1), (3, 1000), (7, 16), (2, 100)):
-        seen, taken = (wp.zeros(length, dtype=int, device="cpu") for length in (count, 1))
-        inputs = [count, taken, seen]
-        launch_on_cores(partial(wp.launch, count_item_kernel, 1, inputs, device="cpu"), cores_for(count, 1, threads))
-        # Each thread that began before the items were gone has found that none is left.
-        assert (seen.numpy() == 1).all() and 1 <= taken.numpy()[0] - count <= min(threads, count)
-    with pytest.raises(Exception, match="'seen'"):
-        launch_on_cores(partial(wp.launch, count_item_kernel, 1, [100, taken, 3.5], device="cpu"), 2)
-
-
-def test_a_busy_thread_keeps_no_launch_that_ended_without_it():
-    go_on, items = threading.Event(), np.zeros(1)
-    busy, kept = workers(1).submit(go_on.wait), weakref.ref(items)
-    try:
-        launch_on_cores(partial(items.fill, 1), 2)
-        del items
-        gc.collect()
-        assert kept() is None
-    finally:
-        go_on.set()
-        busy.result()
