@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.poses import HALF, PairBatch
-from warp_abtree.kernels.intersect.face_pairs import Hits, read_total
+from warp_abtree.kernels.intersect.face_pairs import Hits, is_whole
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -73,14 +73,7 @@ def integrate_rotation(q: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d
 @wp.kernel
 def judge_contacts_kernel(batch: PairBatch, hits: Hits, bodies_out: Bodies):
     """Note whether a query found all contacts within its capacity; one thread."""
-    whole = batch.launched[0] >= 0 and wp.uint32(batch.count[0]) <= wp.uint32(batch.pairs.shape[0])
-    whole = whole and wp.uint32(hits.total[0]) <= wp.uint32(hits.face.shape[0])
-    whole = whole and read_total(hits.witness_total) <= wp.int64(hits.face.shape[0])
-    if hits.uncertain.shape[0] > 0:
-        whole = whole and wp.uint32(hits.uncertain_total[0]) <= wp.uint32(hits.uncertain.shape[0])
-    if hits.apart.shape[0] > 0:
-        whole = whole and wp.uint32(hits.apart_total[0]) <= wp.uint32(hits.apart.shape[0])
-    bodies_out.is_whole[0] = wp.where(whole, 1, 0)
+    bodies_out.is_whole[0] = wp.where(is_whole(batch, hits), 1, 0)
 
 
 @wp.kernel

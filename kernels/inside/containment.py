@@ -57,12 +57,13 @@ def find_contained_kernel(
 
     Args:
         near_hit_inout: Whether each pair is near, shape [pair]; [0] where no distance was asked.
+        batch: Pairs that the traversal passed over, as their `within` says, are passed over here too.
         contained_out: Face of the component that is inside, shape [pair].
     """
     p = wp.tid()
     if p >= batch.count[0] or p >= batch.pairs.shape[0] or batch.launched[0] == STALE:
         return
-    if hits_inout.any_hit[p] != 0:
+    if hits_inout.any_hit[p] != 0 or batch.poses[p].within < wp.float64(0.0):
         return
     a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
     pose = batch.poses[p]

@@ -144,14 +144,17 @@ def add_inside_point_kernel(
     hits: Hits,
     manifolds_inout: Manifolds,
 ):
-    """Add points of what is inside to those of the pairs that intersect, of which one is a solid; a warp a pair."""
+    """Add points of what is inside to those of the pairs that intersect, of which one is a solid; a warp a pair.
+
+    Pairs that the traversal passed over, as their `within` says, are passed over here too.
+    """
     p = wp.tid() / warp_size()
     if p >= batch.count[0] or p >= batch.pairs.shape[0] or batch.launched[0] == STALE:
         return
     a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
-    if hits.any_hit[p] == 0 or (solids.is_solid[a] == 0 and solids.is_solid[b] == 0):
-        return
     pose = batch.poses[p]
+    if hits.any_hit[p] == 0 or pose.within < wp.float64(0.0) or (solids.is_solid[a] == 0 and solids.is_solid[b] == 0):
+        return
     scaling = make_scale(trees, pose, a, b)
     first = make_solid(trees, pose, scaling, False, trees.objects.state[a])
     second = make_solid(trees, pose, scaling, True, trees.objects.state[b])

@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import ModelPool, Trees
 from warp_abtree.kernels.base.boxes import map_point
-from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.exact.predicates import FLOAT32, UNCERTAIN
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair, load_near
 from warp_abtree.kernels.triangle.distance import triangles_near
@@ -212,3 +212,16 @@ def read_total(total: wp.array(dtype=wp.int32)):
     if total.shape[0] > 0:
         count = wp.int64(wp.uint32(total[0]))
     return count
+
+
+@wp.func
+def is_whole(batch: PairBatch, hits: Hits):
+    """Return whether a launch ran, and lost nothing for lack of room."""
+    whole = batch.launched[0] >= 0 and wp.uint32(batch.count[0]) <= wp.uint32(batch.pairs.shape[0])
+    whole = whole and wp.uint32(hits.total[0]) <= wp.uint32(hits.face.shape[0])
+    whole = whole and read_total(hits.witness_total) <= wp.int64(hits.face.shape[0])
+    if hits.uncertain.shape[0] > 0:
+        whole = whole and wp.uint32(hits.uncertain_total[0]) <= wp.uint32(hits.uncertain.shape[0])
+    if hits.apart.shape[0] > 0:
+        whole = whole and wp.uint32(hits.apart_total[0]) <= wp.uint32(hits.apart.shape[0])
+    return whole

@@ -98,7 +98,8 @@ def relative_poses(with_distances: bool):
         """Compute the pose of B in A's frame once a pair, A the smaller index, and clear what the traversal counts.
 
         Args:
-            within: Distances [world units] that boxes are to be widened by, shape [pair]; [0] for intersection.
+            within: Distances [world units] that boxes are to be widened by, shape [pair], -inf for a pair that is
+                passed over; [0] for intersection.
         """
         p = wp.tid()
         count = wp.min(batch_inout.count[0], batch_inout.pairs.shape[0])

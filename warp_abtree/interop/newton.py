@@ -131,6 +131,9 @@ class NewtonContacts(DeviceMemory):
         solids: Mesh shapes that are solids, by index, or True for all: what lies inside one has points as deep as it
             is far from the surface, also once no face crosses. Of closed models, see `Scene.add`.
 
+        remember: As for `ManifoldQuery`: pairs that hardly move are not searched again. `query.forget()` where the
+            contacts are not to depend on the calls before, such as at the start of an episode.
+
     Attributes:
         scene: `Scene` of the shapes, at their finest LODs; `scene.set_lods` changes these.
         shapes: Newton's shape of each object, int32 (n,).
@@ -144,7 +147,7 @@ class NewtonContacts(DeviceMemory):
         MeshError: A solid whose mesh is not closed; the message names edges.
     """
 
-    def __init__(self, model, models=None, capacity=None, points=POINTS_MAX, solids=False):
+    def __init__(self, model, models=None, capacity=None, points=POINTS_MAX, solids=False, remember=True):
         import newton
 
         self.newton = newton
@@ -176,7 +179,7 @@ class NewtonContacts(DeviceMemory):
         self._keep_settings()
         self._place(model.body_q)
         own = wp.array(reach, dtype=wp.vec4d, device=self.device)
-        self.query = ManifoldQuery(self.scene, None, capacity, gap=own, points=points)
+        self.query = ManifoldQuery(self.scene, None, capacity, gap=own, points=points, remember=remember)
         self._first = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._grow()
 

@@ -50,6 +50,7 @@ class Dynamics(RigidBodies):
         capacity: `Buffers`, or the initial capacity for contacts; `step` grows it, `launch` does not.
         continuous: Whether surfaces that are apart are proved to stay apart: bodies stop, for the rest of a step, short
             of where they would meet, and rest a little apart. Kinematic objects stop too.
+        remember: As for `ManifoldQuery`: pairs that hardly move are not searched again.
 
     Attributes:
         bodies, mass, rigid, kinematic: As `RigidBodies`.
@@ -71,6 +72,7 @@ class Dynamics(RigidBodies):
         angular_velocity=(0.0, 0.0, 0.0),
         capacity: Buffers | int | None = None,
         continuous: bool = False,
+        remember: bool | float = True,
     ):
         super().__init__(scene, gravity, kinematic, velocity, angular_velocity)
         self.friction = float(finite_array(friction, "friction", ()))
@@ -78,7 +80,7 @@ class Dynamics(RigidBodies):
             raise ValueError(f"friction {friction!r} is below 0")
         by_color = current_regime().relax_by_color
         self._by_color = not self.device.is_cpu if by_color is None else by_color
-        self.query = ManifoldQuery(scene, None, capacity, gap=AheadGapStage(scene, self.bodies))
+        self.query = ManifoldQuery(scene, None, capacity, gap=AheadGapStage(scene, self.bodies), remember=remember)
         self.certified = None
         if flag(continuous, "continuous"):
             self.certified = CertifiedMotions(scene, self.bodies, Buffers(pairs=check_capacity(capacity).pairs))

@@ -298,19 +298,23 @@ class ContactStage(Stage):
         return wp.float64 if np.dtype(self.dtype) == np.float64 else wp.float32
 
 
-def plan_contacts(precision, within, gap, sums: bool, dtype: Any = np.float64) -> list[Stage]:
+def plan_contacts(precision, within, gap, sums: bool, dtype: Any = np.float64, memory=None) -> list[Stage]:
     """Return the stages that find contacts and their summaries, or those that are reduced to points.
+
+    memory is the stage that finds the pairs that rest, or None.
 
     Raises:
         ValueError: An unknown precision.
     """
     check_request("faces", precision)
-    intersect = IntersectStage("faces", precision, gap is not None, reads=False, reduced=not sums)
+    intersect = IntersectStage("faces", precision, gap is not None, reads=False, reduced=not sums, resting=memory)
     apart: list[Stage] = [] if within is None else [ApartStage(within)]
     if gap is not None:
         gaps = gap if isinstance(gap, GapStage) else GapStage(gap)
         gaps.give_to(intersect.hits, precision)
         apart.append(gaps)
+    if memory is not None:
+        apart.append(memory)
     slots: list[Stage] = [] if sums else [SlotStage(gap is not None)]
     return [*apart, intersect, *slots, InsideStage(), ContactStage(precision, gap is not None and sums, sums, dtype)]
 

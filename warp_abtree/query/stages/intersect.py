@@ -52,6 +52,7 @@ class IntersectStage(HitStage):
         with_gap: Whether the hits have gaps.
         reduced: Whether what is apart is only listed, for another stage to reduce.
         reads: Whether results have the hits as rows.
+        resting: `MemoryStage` of pairs that are passed over, or None.
 
     Attributes:
         traversal: `Traversal`, which other stages share.
@@ -59,14 +60,14 @@ class IntersectStage(HitStage):
 
     traversal: Traversal
 
-    def __init__(self, output="any", precision="exact", with_gap=False, reads=True, reduced=False):
+    def __init__(self, output="any", precision="exact", with_gap=False, reads=True, reduced=False, resting=None):
         super().__init__()
         self._reduced = reduced
         self._is_exact, self._with_gap, self._reads = precision == "exact", with_gap, reads and output == "faces"
         self._mode = int(face_pairs.GAP if with_gap else PRECISIONS[precision])
         if reduced and with_gap:
             self._mode = int(face_pairs.NEAR_LISTED)
-        self._output = int(OUTPUTS[output])
+        self._output, self._resting = int(OUTPUTS[output]), resting
 
     def attach(self, operator: Operator):
         """Take the operator, and give it the hits."""
@@ -102,6 +103,8 @@ class IntersectStage(HitStage):
     def search(self):
         """Traverse the pairs in place. Launches only."""
         within = self.hits.gap if self._with_gap else self._no_distance
+        if self._resting is not None:
+            within = self._resting.asked
         self.traversal.launch("pairs", within, self.hits, self._mode, self._output)
 
     def read(self, found: Found, device: bool, with_rows: bool):

@@ -54,6 +54,7 @@ from warp_abtree.query.operator import Operator
 from warp_abtree.query.result import VECTORS, Found, Result
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
 from warp_abtree.query.stages.contacts import ContactStage, plan_contacts, warn_of_winding
+from warp_abtree.query.stages.memory import MemoryStage, check_remember
 from warp_abtree.query.stages.slots import SlotStage
 from warp_abtree.query.staging import first_rows
 
@@ -85,6 +86,7 @@ class PointStage(Stage):
         contacts: `ContactStage`, the stage before, of what crosses, whose scratch serves on.
         with_gap: Whether faces that are apart have contacts, too.
         point_max: As `ManifoldQuery.point_max`.
+        memory: `MemoryStage`, or None.
 
     Attributes:
         manifolds, curves, witnesses: Device arrays of `kernels.contacts.manifold`: points of pairs, loops of contacts,
@@ -92,7 +94,8 @@ class PointStage(Stage):
         near: Contacts of those witnesses that are apart, `kernels.contacts.contact.Contacts`.
     """
 
-    def __init__(self, slots: SlotStage, contacts: ContactStage, with_gap: bool, point_max: int):
+    def __init__(self, slots: SlotStage, contacts: ContactStage, with_gap: bool, point_max: int, memory=None):
+        self._memory: MemoryStage | None = memory
         self._slots, self._contacts, self._with_gap, self.point_max = slots, contacts, with_gap, point_max
         self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
         self.witnesses, self.near = manifold.Witnesses(), contact.Contacts()
@@ -117,6 +120,11 @@ class PointStage(Stage):
             *fields(self.manifolds, (rooms.pairs, self.point_max), **POINT_FIELDS),
         ]
 
+    def search(self):
+        """Take what is known of pairs that rest. Launches only."""
+        if self._memory is not None:
+            self._memory.resume()
+
     def report(self, count: int | None):
         """Reduce the contacts of the hits in place. Launches only."""
         operator, launch, contacts = self.operator, self.operator.launch_kernel, self._contacts.contacts
@@ -134,6 +142,8 @@ class PointStage(Stage):
             launch(nearest_contacts.keep_nearest_kernel, some, inputs, WARP_SIZE)
         self._choose_points([operator.batch.objects.pool, operator.pair_batch, self._twists, gap])
         self._add_inside_points()
+        if self._memory is not None:
+            self._memory.keep(self.manifolds)
 
     def _offer_crossing(self, count: int, posed):
         """Find the loops of what crosses, and offer its candidates to the slots. Launches only."""
@@ -194,6 +204,11 @@ class ManifoldQuery(Operator):
         scene, pairs, precision, gap: As for `ContactQuery`.
         capacity: `Buffers`, or the hits that there is room for: contacts of faces that cross, and witnesses.
         points: Most points of a pair, 1 to 64. A pair has fewer where these hold against all twists.
+        remember: How far [world units] the points of a pair's smaller object may move, as the other one sees it, until
+            the pair is searched again: while it rests it keeps the points of its last search, moved with the objects,
+            so that a point is missing only if it came nearer by that. True: an eighth of the gap, at most
+            2^-11 of the smaller object's size, half of its box's diagonal. It needs a gap. Results then depend on the
+            launches before, in the same way on every device, until `forget`. None: every launch searches every pair.
 
     Attributes:
         manifolds: Points of each pair, device arrays (pair capacity, points) of `kernels.contacts.manifold.Manifolds`.
@@ -205,18 +220,22 @@ class ManifoldQuery(Operator):
         near_contacts: Contacts of those that are apart, with separations, in the same places; other places hold
             nothing. Empty without a gap.
         point_max: Most points of a pair.
+        memory: `query.stages.memory.MemoryStage`, whose `place` is -1 for a pair that was searched in the last launch;
+            None unless pairs are remembered. Of one that rests `hits.count` is 0.
     """
 
     growth = 2
     faces: wp.array
     start: wp.array
 
-    def __init__(self, scene, pairs=None, capacity=None, precision="exact", gap=None, points=POINTS_MAX):
+    def __init__(self, scene, pairs=None, capacity=None, precision="exact", gap=None, points=POINTS_MAX, remember=None):
         self.point_max = whole_number(points, "points", 1, 64)
-        stages = plan_contacts(precision, None, gap, sums=False)
+        distance = check_remember(remember, gap)
+        self.memory = None if distance is None else MemoryStage(distance, self.point_max)
+        stages = plan_contacts(precision, None, gap, sums=False, memory=self.memory)
         contacts: Any = stages[-1]
         slots: Any = next(stage for stage in stages if isinstance(stage, SlotStage))
-        found = PointStage(slots, contacts, gap is not None, self.point_max)
+        found = PointStage(slots, contacts, gap is not None, self.point_max, self.memory)
         self.contacts, self.manifolds, self.curves = contacts.contacts, found.manifolds, found.curves
         self.witnesses, self.witness_rows, self.near_contacts = found.witnesses, slots.rows, found.near
         warn_of_winding(scene)
@@ -225,6 +244,11 @@ class ManifoldQuery(Operator):
     def set_pairs(self, pairs, within=None, gap=None):
         """Query other pairs from now on, as `ContactQuery.set_pairs`; there is no within."""
         self.ask_pairs(pairs, within=within, gap=gap)
+
+    def forget(self):
+        """Search every pair in the next launch, as if it were the first; nothing without `remember`. Launches only."""
+        if self.memory is not None:
+            self.memory.forget()
 
     def result(self, device: bool = False, with_points: bool = True) -> Result:
         """Return the counts and, unless told otherwise, the contact points of the last launch, as `Query.result`."""

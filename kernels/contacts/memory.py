@@ -1,0 +1,268 @@
+"""Contact points kept between launches: object pairs that have hardly moved since their search keep its points.
+
+A pair rests while no point of its smaller object's box has moved farther, as the other one sees it, than a distance,
+its gap has grown by no more than what is left of that, and neither object has changed its LOD. It is not traversed.
+Each of its points is one of either object, which were the same when the pair was searched: it lies in their middle now,
+and is as much less deep as they have come apart along its normal, which turns with the lower object. So what the pair
+lacks is a point that came nearer by that distance at most. The motion counts from the search, not from the last launch,
+so that slow motions add up.
+
+What a launch finds then depends on those before it, in the same way on every device. There are two tables, by turns:
+one is read, and the other written, in the order of the launch's pairs. Source of contacts as a point of either body:
+the persistent manifolds of physics engines, such as Bullet's and PhysX's.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.base.arrays import Trees, pair_key
+from warp_abtree.kernels.base.nodes import load_node
+from warp_abtree.kernels.base.poses import PairBatch, pose_point, relative_pose
+from warp_abtree.kernels.contacts.manifold import Manifolds
+from warp_abtree.kernels.contacts.slots import tree_size
+from warp_abtree.kernels.intersect.face_pairs import Hits, is_whole
+
+wp.set_module_options(native.options())
+
+# Unless told otherwise a pair rests within this part of its gap, and of its smaller object's size: half of its box's
+# diagonal, so that wide gaps do not hide what comes.
+GAP_SHARE, SIZE_SHARE = wp.constant(wp.float64(2.0**-3)), wp.constant(wp.float64(2.0**-11))
+
+
+@wp.struct
+class PointMemory:
+    """Points of the last search of object pairs, in two tables."""
+
+    turn: wp.array(dtype=wp.int32)  # the table that is read, shape [1]
+    known: wp.array(dtype=wp.int32)  # pairs in it, shape [1]
+    pairs: wp.array2d(dtype=wp.vec2i)  # in the order of the launch, shape [2, pair]
+    lods: wp.array2d(dtype=wp.vec2i)  # of both objects when they were searched, shape [2, pair]
+    gap: wp.array2d(dtype=wp.float64)  # within which they were [world units], shape [2, pair]
+    rotation: wp.array2d(dtype=wp.mat33d)  # of B in A's frame then, A the lower object, shape [2, pair]
+    translation: wp.array2d(dtype=wp.vec3d)  # shape [2, pair]
+    any_hit: wp.array2d(dtype=wp.int32)  # as of `Hits` then, shape [2, pair]
+    count: wp.array2d(dtype=wp.int32)  # points, shape [2, pair]
+    point_a: wp.array3d(dtype=wp.vec3d)  # [units of A's model], A's frame, shape [2, pair, points]
+    point_b: wp.array3d(dtype=wp.vec3d)  # [units of B's model], B's frame, shape [2, pair, points]
+    normal: wp.array3d(dtype=wp.vec3d)  # from the pair's first object to its second, A's frame, shape [2, pair, points]
+    depth: wp.array3d(dtype=wp.float64)  # [world units] then, shape [2, pair, points]
+
+
+@wp.struct
+class Rest:
+    """How far the objects of a pair may have moved while it rests."""
+
+    distance: wp.float64  # [world units], negative for `GAP_SHARE` and `SIZE_SHARE`
+    sorted: wp.bool  # whether pairs are in the order of their objects; else they keep their places
+
+
+@wp.func
+def find_remembered(p: wp.int32, pair: wp.vec2i, rest: Rest, memory: PointMemory):
+    """Return the place of an object pair in the table that is read, -1 where it is not there."""
+    turn, low, high = memory.turn[0], wp.int32(0), wp.int32(memory.known[0])
+    if not rest.sorted:
+        low = wp.min(p, high)
+    while rest.sorted and low < high:
+        middle = (low + high) / 2
+        if pair_key(memory.pairs[turn, middle]) < pair_key(pair):
+            low = middle + 1
+        else:
+            high = middle
+    if low < memory.known[0] and memory.pairs[turn, low] == pair:
+        return low
+    return wp.int32(-1)
+
+
+@wp.func
+def lods_of(trees: Trees, pair: wp.vec2i):
+    return wp.vec2i(
+        trees.states.lod[trees.objects.state[pair[0]]],
+        trees.states.lod[trees.objects.state[pair[1]]],
+    )
+
+
+@wp.func
+def see_point(of_b: bool, rotation: wp.mat33d, translation: wp.vec3d, x: wp.vec3d):
+    """Return a point of B in A's frame, or one of A in B's."""
+    if of_b:
+        return pose_point(rotation, translation, x)
+    return wp.transpose(rotation) * (x - translation)
+
+
+@wp.func
+def farthest_motion(trees: Trees, a: wp.int32, b: wp.int32, rotation: wp.mat33d, translation: wp.vec3d):
+    """Return how far the corners of the smaller object's box have moved at most since B had a pose in A's frame."""
+    rotation_now, translation_now = relative_pose(trees.objects, a, b)
+    of_a, of_b = trees.objects.state[a], trees.objects.state[b]
+    moves_b = tree_size(trees, of_b) < tree_size(trees, of_a)
+    own = wp.where(moves_b, of_b, of_a)
+    root = load_node(trees.states, trees.states.node_start[own] + 1)
+    centre, farthest = trees.models.centre[trees.states.model[own]], wp.float64(0.0)
+    for k in range(8):
+        x = wp.vec3d(
+            wp.float64(wp.where((k & 1) == 0, root.lower[0], root.upper[0])),
+            wp.float64(wp.where((k & 2) == 0, root.lower[1], root.upper[1])),
+            wp.float64(wp.where((k & 4) == 0, root.lower[2], root.upper[2])),
+        )
+        now = see_point(moves_b, rotation_now, translation_now, centre + x)
+        farthest = wp.max(farthest, wp.length(now - see_point(moves_b, rotation, translation, centre + x)))
+    return farthest
+
+
+@wp.kernel
+def find_resting_kernel(
+    rest: Rest,
+    trees: Trees,
+    batch: PairBatch,
+    gap: wp.array(dtype=wp.float64),
+    memory: PointMemory,
+    place_out: wp.array(dtype=wp.int32),
+    asked_out: wp.array(dtype=wp.float64),
+):
+    """Find out whether one object pair a thread rests.
+
+    Args:
+        gap: Of each pair [world units], shape [pair].
+        place_out: Its place in the table that is read, -1 for a pair that is to be searched, shape [pair].
+        asked_out: What the traversal takes as gap: -inf for a pair that rests, shape [pair].
+    """
+    p = wp.tid()
+    if p >= wp.min(batch.count[0], batch.pairs.shape[0]):
+        return
+    place_out[p] = -1
+    asked_out[p] = gap[p]
+    pair, turn = batch.pairs[p], memory.turn[0]
+    m = find_remembered(p, pair, rest, memory)
+    if m < 0:
+        return
+    if not (memory.lods[turn, m] == lods_of(trees, pair)):
+        return
+    a, b = wp.min(pair[0], pair[1]), wp.max(pair[0], pair[1])
+    limit = wp.float64(rest.distance)
+    if limit < wp.float64(0.0):
+        size = wp.min(tree_size(trees, trees.objects.state[a]), tree_size(trees, trees.objects.state[b]))
+        limit = wp.min(GAP_SHARE * gap[p], SIZE_SHARE * size)
+    moved = farthest_motion(trees, a, b, memory.rotation[turn, m], memory.translation[turn, m])
+    if moved + wp.max(gap[p] - memory.gap[turn, m], wp.float64(0.0)) <= limit:
+        place_out[p] = m
+        asked_out[p] = -wp.float64(wp.inf)
+
+
+@wp.kernel
+def resume_resting_kernel(batch: PairBatch, place: wp.array(dtype=wp.int32), memory: PointMemory, hits_inout: Hits):
+    """Say of one object pair a thread, if it rests, what was known of whether it intersects.
+
+    Args:
+        place: As for `find_resting_kernel`.
+    """
+    p = wp.tid()
+    if p < wp.min(batch.count[0], batch.pairs.shape[0]) and place[p] >= 0:
+        hits_inout.any_hit[p] = memory.any_hit[memory.turn[0], place[p]]
+
+
+@wp.func
+def recall_points(
+    p: wp.int32,
+    m: wp.int32,
+    gap: wp.float64,
+    trees: Trees,
+    batch: PairBatch,
+    memory: PointMemory,
+    manifolds: Manifolds,
+):
+    """Write the points of a pair that rests, place m in the table that is read, but those that are a gap apart."""
+    turn, found = memory.turn[0], wp.int32(0)
+    a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
+    rotation, position = trees.objects.rotation[a], trees.objects.position[a]
+    sense = wp.where(batch.pairs[p][0] == a, wp.float64(1.0), wp.float64(-1.0))
+    for k in range(memory.count[turn, m]):
+        of_a = pose_point(rotation, position, memory.point_a[turn, m, k])
+        of_b = pose_point(trees.objects.rotation[b], trees.objects.position[b], memory.point_b[turn, m, k])
+        n = rotation * memory.normal[turn, m, k]
+        depth = memory.depth[turn, m, k] + sense * wp.dot(of_a - of_b, n)
+        if depth > -gap:
+            manifolds.point[p, found] = wp.float64(0.5) * (of_a + of_b)
+            manifolds.normal[p, found] = n
+            manifolds.depth[p, found] = depth
+            found += 1
+    manifolds.count[p] = found
+
+
+@wp.func
+def keep_points(p: wp.int32, m: wp.int32, memory: PointMemory):
+    """Copy what is known of a pair that rests, place m in the table that is read, to place p in the other."""
+    turn = memory.turn[0]
+    other = 1 - turn
+    memory.lods[other, p] = memory.lods[turn, m]
+    memory.gap[other, p] = memory.gap[turn, m]
+    memory.rotation[other, p] = memory.rotation[turn, m]
+    memory.translation[other, p] = memory.translation[turn, m]
+    memory.any_hit[other, p] = memory.any_hit[turn, m]
+    memory.count[other, p] = memory.count[turn, m]
+    for k in range(memory.count[turn, m]):
+        memory.point_a[other, p, k] = memory.point_a[turn, m, k]
+        memory.point_b[other, p, k] = memory.point_b[turn, m, k]
+        memory.normal[other, p, k] = memory.normal[turn, m, k]
+        memory.depth[other, p, k] = memory.depth[turn, m, k]
+
+
+@wp.func
+def note_points(
+    p: wp.int32,
+    gap: wp.float64,
+    any_hit: wp.int32,
+    trees: Trees,
+    batch: PairBatch,
+    manifolds: Manifolds,
+    memory: PointMemory,
+):
+    """Write what was found of a pair that was searched to the table that is not read."""
+    other = 1 - memory.turn[0]
+    a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
+    rotation, translation = relative_pose(trees.objects, a, b)
+    back_a, back_b = wp.transpose(trees.objects.rotation[a]), wp.transpose(trees.objects.rotation[b])
+    memory.lods[other, p] = lods_of(trees, batch.pairs[p])
+    memory.gap[other, p] = gap
+    memory.rotation[other, p] = rotation
+    memory.translation[other, p] = translation
+    memory.any_hit[other, p] = any_hit
+    memory.count[other, p] = manifolds.count[p]
+    for k in range(manifolds.count[p]):
+        memory.point_a[other, p, k] = back_a * (manifolds.point[p, k] - trees.objects.position[a])
+        memory.point_b[other, p, k] = back_b * (manifolds.point[p, k] - trees.objects.position[b])
+        memory.normal[other, p, k] = back_a * manifolds.normal[p, k]
+        memory.depth[other, p, k] = manifolds.depth[p, k]
+
+
+@wp.kernel
+def keep_points_kernel(
+    trees: Trees,
+    batch: PairBatch,
+    gap: wp.array(dtype=wp.float64),
+    place: wp.array(dtype=wp.int32),
+    hits: Hits,
+    manifolds_inout: Manifolds,
+    memory_inout: PointMemory,
+):
+    """Take the points of one object pair a thread from the memory, if it rests; write what is known to the other table.
+
+    Args:
+        gap, place: As for `find_resting_kernel`.
+    """
+    p = wp.tid()
+    if p >= wp.min(batch.count[0], batch.pairs.shape[0]):
+        return
+    memory_inout.pairs[1 - memory_inout.turn[0], p] = batch.pairs[p]
+    m = place[p]
+    if m >= 0:
+        recall_points(p, m, gap[p], trees, batch, memory_inout, manifolds_inout)
+        keep_points(p, m, memory_inout)
+    else:
+        note_points(p, gap[p], hits.any_hit[p], trees, batch, manifolds_inout, memory_inout)
+
+
+@wp.kernel
+def turn_memory_kernel(batch: PairBatch, hits: Hits, memory_inout: PointMemory):
+    """Read the other table from now on, of which nothing is known where the launch lost something; one thread."""
+    memory_inout.turn[0] = 1 - memory_inout.turn[0]
+    memory_inout.known[0] = wp.where(is_whole(batch, hits), batch.count[0], 0)
