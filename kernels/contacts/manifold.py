@@ -50,7 +50,7 @@ class Witnesses:
     point: wp.array2d(dtype=wp.vec3d)  # [world units], shape [witness, COLUMN_CORNERS]
     depth: wp.array2d(dtype=wp.float64)  # [world units], NO_DEPTH or NO_POINT, shape [witness, COLUMN_CORNERS]
     nearest_only: wp.array(dtype=wp.int32)  # whether another face may be nearer, 0 or 1, shape [witness]
-    wrench: wp.array(dtype=wp.vec4)  # see `candidates`, shape [2 * COLUMN_CORNERS * witness]
+    wrench: wp.array(dtype=wp.vec4)  # see `points`, shape [2 * COLUMN_CORNERS * witness]
 
 
 @wp.struct

@@ -10,9 +10,9 @@ from warp_abtree.kernels.contacts import memory
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.stage import Array, Rooms, Stage
 
-PAIR_FIELDS = {"pairs": wp.vec2i, "lods": wp.vec2i, "gap": wp.float64, "rotation": wp.mat33d, "translation": wp.vec3d}
-PAIR_FIELDS |= {"any_hit": wp.int32, "count": wp.int32}
-POINT_FIELDS = {"point_a": wp.vec3d, "point_b": wp.vec3d, "normal": wp.vec3d, "depth": wp.float64}
+TABLE_PAIRS = {"pairs": wp.vec2i, "lods": wp.vec2i, "gap": wp.float64, "rotation": wp.mat33d, "translation": wp.vec3d}
+TABLE_PAIRS |= {"any_hit": wp.int32, "count": wp.int32}
+TABLE_POINTS = {"point_a": wp.vec3d, "point_b": wp.vec3d, "normal": wp.vec3d, "depth": wp.float64}
 
 
 def check_remember(remember, gap) -> float | None:
@@ -63,7 +63,7 @@ class MemoryStage(Stage):
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return both tables, which keep what they hold where there is more room, and what has an entry a pair."""
         made = [Array(self, "place", wp.int32, rooms.pairs), Array(self, "asked", wp.float64, rooms.pairs)]
-        for names, shape in ((PAIR_FIELDS, ()), (POINT_FIELDS, (self._points,))):
+        for names, shape in ((TABLE_PAIRS, ()), (TABLE_POINTS, (self._points,))):
             for name, dtype in names.items():
                 copy = partial(_copy_table, getattr(self.memory, name))
                 made.append(Array(self.memory, name, dtype, (2, rooms.pairs, *shape), copy))
