@@ -133,6 +133,7 @@ class NewtonContacts(DeviceMemory):
 
         remember: As for `ManifoldQuery`: pairs that hardly move are not searched again. `query.forget()` where the
             contacts are not to depend on the calls before, such as at the start of an episode.
+        originals: As for `ManifoldQuery`: points on the shapes' own meshes, of a scene at coarser LODs.
 
     Attributes:
         scene: `Scene` of the shapes, at their finest LODs; `scene.set_lods` changes these.
@@ -147,7 +148,9 @@ class NewtonContacts(DeviceMemory):
         MeshError: A solid whose mesh is not closed; the message names edges.
     """
 
-    def __init__(self, model, models=None, capacity=None, points=POINTS_MAX, solids=False, remember=True):
+    def __init__(
+        self, model, models=None, capacity=None, points=POINTS_MAX, solids=False, remember=True, originals=False
+    ):
         import newton
 
         self.newton = newton
@@ -179,7 +182,9 @@ class NewtonContacts(DeviceMemory):
         self._keep_settings()
         self._place(model.body_q)
         own = wp.array(reach, dtype=wp.vec4d, device=self.device)
-        self.query = ManifoldQuery(self.scene, None, capacity, gap=own, points=points, remember=remember)
+        self.query = ManifoldQuery(
+            self.scene, None, capacity, gap=own, points=points, remember=remember, originals=originals
+        )
         self._first = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._grow()
 

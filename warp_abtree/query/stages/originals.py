@@ -1,7 +1,21 @@
 """Objects at their finest LODs, for questions about their original meshes."""
 
+from typing import Any
+
+from warp_abtree.kernels.base.lanes import WARP_SIZE
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.inside import originals
 from warp_abtree.query.broad_phase import BroadPhase
+from warp_abtree.query.operator import Operator
+from warp_abtree.query.stage import Array, Rooms, Stage
 from warp_abtree.state.batch import Batch
+
+
+def make_finest(batch: Batch) -> Batch:
+    """Return a batch of the same objects at their finest LODs, as they are posed; their tree states are made once."""
+    finest = batch.with_own_states(follows_poses=True)
+    finest.add_finest(range(len(batch.models.lod_max)))
+    return finest
 
 
 class Originals:
@@ -13,8 +27,7 @@ class Originals:
     """
 
     def __init__(self, batch: Batch):
-        self._of, self.batch = batch, batch.with_own_states(follows_poses=True)
-        self.batch.add_finest(range(len(batch.models.lod_max)))
+        self._of, self.batch = batch, make_finest(batch)
         self.broad_phase = BroadPhase(self.batch)
 
     def follow_filter(self):
@@ -22,3 +35,30 @@ class Originals:
         if self.batch.excluded is not self._of.excluded:
             self.batch.exclude(self._of.excluded)
             self.broad_phase = BroadPhase(self.batch)
+
+
+class OriginalStage(Stage):
+    """Move the candidate points of contacts at LODs to the original surfaces.
+
+    Attributes:
+        poses: Of the originals of each pair, device `PairPose` (pair,).
+    """
+
+    poses: Any
+
+    def attach(self, operator: Operator):
+        """Take the operator, and make the tree states."""
+        super().attach(operator)
+        self._finest = make_finest(operator.batch)
+
+    def arrays(self, rooms: Rooms) -> list[Array]:
+        """Return the poses."""
+        return [Array(self, "poses", PairPose, rooms.pairs)]
+
+    def project(self, some: int, gap: Any, faces: Any, rows: Any, witnesses: Any):
+        """Move the candidates of so many witnesses at most. Launches only."""
+        operator, trees = self.operator, self._finest.trees
+        asked, room = operator.pair_batch, operator.rooms.pairs
+        operator.launch_kernel(originals.pose_original_kernel, room, [trees, asked, self.poses])
+        inputs = [operator.batch.trees, trees, asked, self.poses, gap, faces, operator.hits, rows, witnesses]
+        operator.launch_kernel(originals.project_witness_kernel, some, inputs, WARP_SIZE)

@@ -45,7 +45,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import whole_number
+from warp_abtree.checks.arguments import flag, whole_number
 from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.contacts import column, contact, loops, manifold, near_points
 from warp_abtree.kernels.contacts import points as point_kernels
@@ -55,6 +55,7 @@ from warp_abtree.query.result import VECTORS, Found, Result
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
 from warp_abtree.query.stages.contacts import ContactStage, plan_contacts, warn_of_winding
 from warp_abtree.query.stages.memory import MemoryStage, check_remember
+from warp_abtree.query.stages.originals import OriginalStage
 from warp_abtree.query.stages.slots import SlotStage
 from warp_abtree.query.staging import first_rows
 
@@ -87,6 +88,7 @@ class PointStage(Stage):
         with_gap: Whether faces that are apart have contacts, too.
         point_max: As `ManifoldQuery.point_max`.
         memory: `MemoryStage`, or None.
+        originals: `OriginalStage`, or None.
 
     Attributes:
         manifolds, curves, witnesses: Device arrays of `kernels.contacts.manifold`: points of pairs, loops of contacts,
@@ -94,8 +96,11 @@ class PointStage(Stage):
         near: Contacts of those witnesses that are apart, `kernels.contacts.contact.Contacts`.
     """
 
-    def __init__(self, slots: SlotStage, contacts: ContactStage, with_gap: bool, point_max: int, memory=None):
+    def __init__(
+        self, slots: SlotStage, contacts: ContactStage, with_gap: bool, point_max: int, memory=None, originals=None
+    ):
         self._memory: MemoryStage | None = memory
+        self._originals: OriginalStage | None = originals
         self._slots, self._contacts, self._with_gap, self.point_max = slots, contacts, with_gap, point_max
         self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
         self.witnesses, self.near = manifold.Witnesses(), contact.Contacts()
@@ -140,6 +145,8 @@ class PointStage(Stage):
             launch(near_points.find_near_witness_kernel, some, [*posed, *found, self.near, self.witnesses], WARP_SIZE)
             inputs = [*posed[:2], *found, self.near, self.witnesses]
             launch(nearest_contacts.keep_nearest_kernel, some, inputs, WARP_SIZE)
+        if self._originals is not None:
+            self._originals.project(some, gap, self._contacts.faces, self._slots.rows, self.witnesses)
         self._choose_points([operator.batch.objects.pool, operator.pair_batch, self._twists, gap])
         self._add_inside_points()
         if self._memory is not None:
@@ -209,6 +216,9 @@ class ManifoldQuery(Operator):
             so that a point is missing only if it came nearer by that. True: an eighth of the gap, at most
             2^-11 of the smaller object's size, half of its box's diagonal. It needs a gap. Results then depend on the
             launches before, in the same way on every device, until `forget`. None: every launch searches every pair.
+        originals: Whether candidates found at LODs are moved to the original surfaces before points are chosen: to the
+            middle of the points of either that are nearest, with their depth along the normal of the LODs. Whether
+            a pair intersects, and what is inside solids, stays that of the LODs.
 
     Attributes:
         manifolds: Points of each pair, device arrays (pair capacity, points) of `kernels.contacts.manifold.Manifolds`.
@@ -228,18 +238,30 @@ class ManifoldQuery(Operator):
     faces: wp.array
     start: wp.array
 
-    def __init__(self, scene, pairs=None, capacity=None, precision="exact", gap=None, points=POINTS_MAX, remember=None):
+    def __init__(
+        self,
+        scene,
+        pairs=None,
+        capacity=None,
+        precision="exact",
+        gap=None,
+        points=POINTS_MAX,
+        remember=None,
+        originals=False,
+    ):
         self.point_max = whole_number(points, "points", 1, 64)
         distance = check_remember(remember, gap)
         self.memory = None if distance is None else MemoryStage(distance, self.point_max)
         stages = plan_contacts(precision, None, gap, sums=False, memory=self.memory)
         contacts: Any = stages[-1]
         slots: Any = next(stage for stage in stages if isinstance(stage, SlotStage))
-        found = PointStage(slots, contacts, gap is not None, self.point_max, self.memory)
+        surfaces = OriginalStage() if flag(originals, "originals") else None
+        found = PointStage(slots, contacts, gap is not None, self.point_max, self.memory, surfaces)
+        stages += [found] if surfaces is None else [surfaces, found]
         self.contacts, self.manifolds, self.curves = contacts.contacts, found.manifolds, found.curves
         self.witnesses, self.witness_rows, self.near_contacts = found.witnesses, slots.rows, found.near
         warn_of_winding(scene)
-        super().__init__(scene, [*stages, found], pairs, capacity, "faces", sort_pairs=True)
+        super().__init__(scene, stages, pairs, capacity, "faces", sort_pairs=True)
 
     def set_pairs(self, pairs, within=None, gap=None):
         """Query other pairs from now on, as `ContactQuery.set_pairs`; there is no within."""

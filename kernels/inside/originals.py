@@ -1,0 +1,105 @@
+"""Candidate points of contacts at LODs, moved to the original surfaces.
+
+Each goes to the middle between the points of both original surfaces that are nearest to it. Its depth is how far these
+two overlap along its normal, which stays that of the LODs. Both points are the nearest of all faces, up to rounding.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.base.arrays import Trees
+from warp_abtree.kernels.base.poses import HALF, PairBatch, PairPose, pair_pose, pose_point
+from warp_abtree.kernels.contacts.column import COLUMN_CORNERS
+from warp_abtree.kernels.contacts.manifold import NO_POINT, Witnesses
+from warp_abtree.kernels.contacts.slots import WitnessRows
+from warp_abtree.kernels.distance.frame import SearchScale, make_scale
+from warp_abtree.kernels.inside.nearest_face import make_solid, nearest_face, point_features, point_weights
+from warp_abtree.kernels.inside.parity import load_posed_face
+from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK, Hits
+
+wp.set_module_options(native.options())
+
+
+@wp.kernel
+def pose_original_kernel(fine: Trees, batch: PairBatch, poses_out: wp.array(dtype=PairPose)):
+    """Compute the pose of B's original in A's frame once a pair, A the smaller index.
+
+    Args:
+        fine: The objects at their finest LODs.
+    """
+    p = wp.tid()
+    if p >= wp.min(batch.count[0], batch.pairs.shape[0]):
+        return
+    a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
+    poses_out[p] = pair_pose(True, fine, a, b, wp.float64(0.0))
+
+
+@wp.func
+def nearest_point(
+    fine: Trees, pose: PairPose, scaling: SearchScale, of_b: bool, state: wp.int32, x: wp.vec3d, hint: int
+):
+    """Return the point of the surface of A or B that is nearest to a point, all in A's frame."""
+    _, face = nearest_face(fine, pose, make_solid(fine, pose, scaling, of_b, state), x, hint, wp.float64(0.0))
+    a, b, c = load_posed_face(fine, pose, of_b, face)
+    near, _ = point_features(a, b, c, x)
+    u = point_weights(near)
+    return (u[0] * a + u[1] * b) + u[2] * c
+
+
+@wp.func
+def is_finest(trees: Trees, state: wp.int32):
+    """Return whether a tree state is that of the original mesh."""
+    return trees.states.lod[state] == trees.models.lod_max[trees.states.model[state]]
+
+
+@wp.kernel
+def project_witness_kernel(
+    trees: Trees,
+    fine: Trees,
+    batch: PairBatch,
+    poses: wp.array(dtype=PairPose),
+    gap: wp.array(dtype=wp.float64),
+    faces: wp.array(dtype=wp.vec3i),
+    hits: Hits,
+    rows: WitnessRows,
+    witnesses_inout: Witnesses,
+):
+    """Move the candidates of one witness a thread to the original surfaces; drop those that are no nearer than the gap.
+
+    By branch and bound over the tree of either, from the face that the LODs have there. What stands at the finest LODs
+    stays as it is.
+
+    Args:
+        fine, poses: As for `pose_original_kernel`.
+        gap: Of each pair [world units], or [0] for none.
+        faces: Of crossing contacts, as of `ContactQuery`.
+    """
+    w = wp.tid()
+    if w >= wp.min(hits.witness_total[0], rows.item.shape[0]):
+        return
+    item = rows.item[w]
+    if item[0] < 0:
+        return
+    if item[0] < NEAR_BIT:
+        item = faces[item[1]]
+    p = item[0] & PAIR_MASK
+    a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
+    if is_finest(trees, trees.objects.state[a]) and is_finest(trees, trees.objects.state[b]):
+        return
+    swapped, shell, sense = batch.poses[p].swapped, wp.float64(0.0), wp.float64(1.0)
+    if gap.shape[0] > 0:
+        shell = gap[p]
+    if swapped != 0:
+        sense = wp.float64(-1.0)
+    rotation, position = trees.objects.rotation[a], trees.objects.position[a]
+    back, pose = wp.transpose(rotation), poses[p]
+    scaling, n = make_scale(fine, pose, a, b), back * witnesses_inout.normal[w]
+    k = wp.int32(0)
+    while k < COLUMN_CORNERS and not wp.isnan(witnesses_inout.depth[w, wp.min(k, COLUMN_CORNERS - 1)]):
+        x = back * (witnesses_inout.point[w, k] - position)
+        on_a = nearest_point(fine, pose, scaling, False, fine.objects.state[a], x, item[1 + swapped])
+        on_b = nearest_point(fine, pose, scaling, True, fine.objects.state[b], x, item[2 - swapped])
+        depth = sense * wp.dot(on_a - on_b, n)
+        witnesses_inout.point[w, k] = pose_point(rotation, position, HALF * (on_a + on_b))
+        witnesses_inout.depth[w, k] = wp.where(depth > -shell or depth == wp.float64(0.0), depth, NO_POINT)
+        k += 1

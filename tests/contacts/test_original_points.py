@@ -1,0 +1,126 @@
+"""Contact points of LODs moved to the original surfaces: against nearest points of all original faces, in NumPy."""
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from helpers.bodies import FLOOR, about, model_of
+from helpers.scenes import scene_with
+
+import warp_abtree as ab
+
+GAP = 0.15
+
+
+def wavy_plate():
+    """Return a plate of gentle waves, and a ball of many faces."""
+    plate = trimesh.creation.box((4, 4, 1)).subdivide_loop(0)
+    for _ in range(5):
+        plate = plate.subdivide()
+    x, y, _z = plate.vertices.T
+    plate.vertices[:, 2] += np.where(_z > 0, 0.06 * np.sin(3 * x) * np.cos(2 * y), 0)
+    return model_of(plate), model_of(trimesh.creation.icosphere(subdivisions=4))
+
+
+MODELS = wavy_plate()
+
+
+def nearest(x, triangles):
+    """Return the distance of a point from the nearest of some triangles, by its edges and its inside."""
+    a, b, c = (triangles[:, k] for k in range(3))
+    n = np.cross(b - a, c - a)
+    n /= np.linalg.norm(n, axis=1)[:, None]
+    height = np.einsum("ij,ij->i", x - a, n)
+    inside, least = np.ones(len(a), bool), np.full(len(a), np.inf)
+    for p, q in ((a, b), (b, c), (c, a)):
+        edge = q - p
+        s = np.clip(np.einsum("ij,ij->i", x - p, edge) / np.einsum("ij,ij->i", edge, edge), 0, 1)
+        least = np.minimum(least, np.linalg.norm(p + s[:, None] * edge - x, axis=1))
+        inside &= np.einsum("ij,ij->i", np.cross(edge, x - height[:, None] * n - p), n) >= 0
+    return np.where(inside, np.abs(height), least).min()
+
+
+def world_triangles(model, pose):
+    vertices, faces = model.mesh_at(model.lod_max)[:2]
+    r = np.array(wp.quat_to_matrix(wp.quatd(*pose[3:]))).reshape(3, 3)
+    return (vertices @ r.T + pose[:3])[faces]
+
+
+def ask(device, pose, fraction, **options):
+    scene = scene_with(device, (MODELS[0], FLOOR), (MODELS[1], pose))
+    scene.set_lods([int(fraction * model.lod_max) for model in MODELS])
+    return ab.ManifoldQuery(scene, [(0, 1)], **options), scene
+
+
+def off_middle(points, triangles):
+    """Return how far points that are apart are from the middle of two surfaces, and their depths from the distance."""
+    found = []
+    for x, depth in zip(points["point"], points["depth"]):
+        if depth < 0:
+            far = [nearest(x, own) for own in triangles]
+            found.append((abs(far[0] - far[1]), abs(far[0] + far[1] + depth)))
+    return found
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_points_lie_in_the_middle_of_both_originals(device, order):
+    """As far from the nearest original face of either, and their depths are these distances, whatever the LODs say.
+
+    Each lies between the points nearest to where the LODs had it, which differ from the nearest of all in second order.
+    """
+    rng, off, coarse = np.random.default_rng(0), [], []
+    for _ in range(10):
+        pose = np.array([*rng.uniform(-0.8, 0.8, 2), 1.0 + rng.uniform(-0.01, 0.1), *about(rng.normal(size=3), 3.0)])
+        query, scene = ask(device, pose, 0.08, gap=GAP, originals=True)
+        query.set_pairs([order])
+        points = query.run().points
+        triangles = [world_triangles(*one) for one in zip(MODELS, (np.array(FLOOR, float), pose))]
+        off += off_middle(points, triangles)
+        coarse += off_middle(ab.ManifoldQuery(scene, [order], gap=GAP).run().points, triangles)
+        assert (points["depth"] > -GAP).all()
+        assert (points["normal"][:, 2] * (1 if order == (0, 1) else -1) > 0.5).all()
+    assert len(off) > 20
+    assert (np.median(off, axis=0) < 0.05 * np.median(coarse, axis=0)).all()
+    assert np.max(off) < 0.03 * GAP
+
+
+@pytest.mark.parametrize("gap", [None, GAP])
+def test_the_finest_lods_stay_as_they_are(device, gap):
+    pose = np.array([0.3, 0.2, 1.0, *about((1, 2, 3), 0.7)])
+    found = []
+    for originals in (False, True):
+        points = ask(device, pose, 1.0, gap=gap, originals=originals)[0].run().points
+        found.append([np.ascontiguousarray(values).tobytes() for values in points.values()])
+    assert found[0] == found[1] and len(found[0][0])
+
+
+def test_without_a_gap_points_are_inside(device):
+    """What crosses at the LODs alone has no points."""
+    for height, meets in ((1.03, True), (1.058, False)):  # a crest is at 0.06, coarse ones are higher
+        query, _ = ask(device, np.array([np.pi / 6 + 0.1, 0.1, height, 0, 0, 0, 1.0]), 0.05, originals=True)
+        result = query.run()
+        depth = result.points["depth"]
+        assert (depth >= 0).all() and (len(depth) > 0 or not meets)
+
+
+def test_lods_and_poses_that_change_are_followed(device):
+    """The originals follow poses, and what is kept of a pair that rests are points on them."""
+    pose = np.array([np.pi / 6, 0, 1.1, 0, 0, 0, 1.0])
+    query, scene = ask(device, pose, 0.05, gap=GAP, originals=True, remember=0.01)
+    query.run()
+    pose[2] -= 0.02
+    scene.set_poses([FLOOR, pose])
+    scene.set_lods([int(0.1 * model.lod_max) for model in MODELS])
+    points = query.run().points
+    depth = points["depth"].max()
+    triangles = [world_triangles(*one) for one in zip(MODELS, (np.array(FLOOR, float), pose))]
+    assert 0 < np.max(off_middle(points, triangles)) < 0.01 * GAP
+    pose[2] -= 0.005
+    scene.set_poses([FLOOR, pose])
+    again = query.run().points["depth"].max()
+    assert query.memory.place.numpy()[0] == 0 and again == pytest.approx(depth + 0.005, abs=1e-4)
+
+
+def test_what_originals_takes(device):
+    with pytest.raises(ValueError, match="originals"):
+        ask(device, np.array([0, 0, 1.0, 0, 0, 0, 1.0]), 1.0, originals=1)
