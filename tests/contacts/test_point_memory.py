@@ -46,9 +46,10 @@ def is_resting(query):
     return query.memory.place.numpy()[: int(query.pair_count.numpy()[0])] >= 0
 
 
-def test_points_of_a_pair_that_rests_move_with_its_objects(device):
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_points_of_a_pair_that_rests_move_with_its_objects(device, order):
     """Each is the middle of what was one point of either, less deep as these come apart: in NumPy, both move."""
-    rng, (scene, query) = np.random.default_rng(0), make(device)
+    rng, (scene, query) = np.random.default_rng(0), make(device, pairs=[order])
     for _ in range(20):
         floor, cube = np.array(FLOOR, float), posed(rng, 0.01, 0.02)
         scene.set_poses([floor, cube])
@@ -67,7 +68,8 @@ def test_points_of_a_pair_that_rests_move_with_its_objects(device):
         normal = first["normal"] @ turn_of(carry).T
         np.testing.assert_allclose(points["normal"], normal, atol=1e-12)
         np.testing.assert_allclose(points["point"], (of_floor + of_cube) / 2, atol=1e-12)
-        depth = first["depth"] - np.einsum("ij,ij->i", of_cube - of_floor, normal)
+        apart = of_cube - of_floor if order == (0, 1) else of_floor - of_cube
+        depth = first["depth"] - np.einsum("ij,ij->i", apart, normal)
         np.testing.assert_allclose(points["depth"], depth, atol=1e-12)
 
 
@@ -182,7 +184,7 @@ def test_pairs_of_the_broad_phase_are_found_again_in_other_places(device):
     poses = [[k, 0, 0.245, *about((0, 0, 1), 0.1 * k)] for k in range(5)]
     poses.insert(2, list(map(float, FLOOR)))
     rng, query = np.random.default_rng(3), ab.ManifoldQuery(scene, gap=GAP, remember=REST)
-    fresh, places = ab.ManifoldQuery(scene, gap=GAP), set()
+    fresh, places, before = ab.ManifoldQuery(scene, gap=GAP), set(), set()
     for _ in range(12):
         away = rng.random(6) < 0.4
         away[2] = False
@@ -194,9 +196,11 @@ def test_pairs_of_the_broad_phase_are_found_again_in_other_places(device):
         np.testing.assert_array_equal(result.any, found.any)
         np.testing.assert_array_equal(result.points["pair"], found.points["pair"])
         np.testing.assert_allclose(result.points["point"], found.points["point"], atol=1e-13)
-        resting = is_resting(query)
+        resting, pairs = is_resting(query), [tuple(pair) for pair in result.pairs.tolist()]
+        assert resting.tolist() == [pair in before for pair in pairs]
+        before = set(pairs)
         places |= set(zip(query.memory.place.numpy()[: len(resting)][resting], np.flatnonzero(resting)))
-    assert any(before != now for before, now in places)
+    assert any(there != here for there, here in places)
 
 
 def test_a_launch_that_lost_something_is_forgotten(device):

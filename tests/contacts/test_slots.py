@@ -1,0 +1,120 @@
+"""Slots of contact witnesses against all near contacts: no contact has a higher score than what its slot keeps."""
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.bodies import about, model_of
+from helpers.samples import sample
+from helpers.scenes import scene_with
+from oracles.triangle import quaternion_matrix
+
+import warp_abtree as ab
+from warp_abtree import testing
+from warp_abtree.kernels.contacts.slots import NORMAL_BINS, SCORES, SLOT_ROOM, SLOTS_A_BIN
+from warp_abtree.query.stages.slots import SlotStage
+
+GAP = 0.12
+BINS, KINDS, ROOM, A_BIN = int(NORMAL_BINS), int(SCORES), int(SLOT_ROOM), int(SLOTS_A_BIN)
+
+
+def slots_of(query):
+    return next(stage for stage in query.stages if isinstance(stage, SlotStage)).slots
+
+
+def decode(key, width):
+    """Return the score and the name in a key of a slot, which has so many bits for the name."""
+    key = int(np.uint64(np.int64(key)))
+    name = ~key & ((1 << width) - 1)
+    bits = ((key >> max(width, 32)) << max(width - 32, 0)) & 0xFFFFFFFF
+    bits = bits & 0x7FFFFFFF if bits >> 31 else ~bits & 0xFFFFFFFF
+    return float(np.uint32(bits).view(np.float32)), name
+
+
+def scores_of(points, depth, across, weight):
+    """Return the nine scores of each contact, by the definition in `kernels.contacts.slots`."""
+    x, y = (weight * points @ direction for direction in across)
+    sum, difference = (x + y) / 2**0.5, (x - y) / 2**0.5
+    parts = [x, -x, y, -y, sum, -sum, difference, -difference]
+    return np.stack([depth, *(depth + part for part in parts)])
+
+
+def bodies(name):
+    if name == "cube on a ball":
+        return trimesh.creation.box((1, 1, 1)).subdivide().subdivide(), trimesh.creation.icosphere(subdivisions=3)
+    return trimesh.creation.torus(1.0, 0.4), trimesh.creation.torus(0.9, 0.3)
+
+
+@pytest.mark.parametrize("warps", [False, True])
+@pytest.mark.parametrize("name", ["cube on a ball", "tori"])
+def test_no_near_contact_beats_the_winner_of_its_slot(device, name, warps):
+    """Faces that look at one another, apart: their nearest points, in float64, of all listed contacts."""
+    rng, meshes, compared, empty = np.random.default_rng(0), bodies(name), 0, 0
+    models = [model_of(mesh) for mesh in meshes]
+    for _ in range(10):
+        way = rng.normal(size=3)
+        pose = np.array([*(way / np.linalg.norm(way) * rng.uniform(1.3, 1.6)), *about(rng.normal(size=3), 3.0)])
+        scene = scene_with(device, models[0], (models[1], pose))
+        with testing.regime(warps=True if warps else None):
+            query = ab.ManifoldQuery(scene, [(0, 1)], gap=GAP)
+            query.run()
+        rows = scene.intersect([(0, 1)], output="contacts", gap=GAP).contacts
+        facing = (np.einsum("ij,ij->i", rows["normal_a"], rows["normal_b"]) <= -0.51) & (rows["separation"] > 1e-4)
+        along = np.maximum(
+            np.abs(np.einsum("ij,ij->i", rows["normal"], rows["normal_a"])),
+            np.abs(np.einsum("ij,ij->i", rows["normal"], rows["normal_b"])),
+        )
+        ahead = np.einsum("ij,ij->i", rows["normal"], rows["normal_a"]) > 0.01
+        ahead &= np.einsum("ij,ij->i", rows["normal"], rows["normal_b"]) < -0.01
+        rows = rows[facing & (along > 0.995) & ahead]
+        slots = slots_of(query)
+        key, directions = slots.key.numpy()[:ROOM], slots.directions.numpy().reshape(BINS, 3, 3).astype(float)
+        (gap, weight), widths = slots.measures.numpy()[0], slots.widths.numpy()[0]
+        scale = gap / GAP
+        points = scale * ((rows["p0"] + rows["p1"]) / 2 - models[0].centre)
+        normal = rows["normal_a"] - rows["normal_b"]
+        cosine = normal @ directions[:, 0].T
+        sorted_cosine = np.sort(cosine, axis=1)
+        clear = sorted_cosine[:, -1] - sorted_cosine[:, -2] > 1e-4  # float32 may tell another bin
+        for k in range(BINS):
+            own = clear & (cosine.argmax(1) == k)
+            kept = [decode(x, int(widths.sum())) for x in key[A_BIN * k + KINDS : A_BIN * k + 2 * KINDS]]
+            if not own.any():
+                empty += 1
+                continue
+            best = scores_of(points[own], -scale * rows["separation"][own], directions[k, 1:], float(weight)).max(1)
+            scores = np.array([score for score, _ in kept])
+            assert (key[A_BIN * k + KINDS : A_BIN * k + 2 * KINDS] != 0).all()
+            assert (scores >= best - 2e-6).all()
+            compared += 1
+    assert compared > 10 and empty > 10
+
+
+@pytest.mark.parametrize("warps", [False, True])
+def test_winners_are_near_and_have_their_scores(device, warps):
+    """Each name is a face pair within the gap, and no score is more than its separation and its reach make it."""
+    rng, ball = np.random.default_rng(1), sample("small ball")
+    vertices, faces = ball.mesh_at(ball.lod_max)[:2]
+    pose = np.array([0.2, 0.3, 2.0, *about(rng.normal(size=3), 2.0)])
+    scene = scene_with(device, ball, (ball, pose))
+    with testing.regime(warps=True if warps else None):
+        query = ab.ManifoldQuery(scene, [(0, 1)], gap=GAP)
+        query.run()
+    rows = scene.intersect([(0, 1)], output="contacts", gap=GAP).contacts
+    near = {tuple(pair): separation for pair, separation in zip(rows["faces"].tolist(), rows["separation"])}
+    slots = slots_of(query)
+    (gap, weight), (of_a, of_b) = slots.measures.numpy()[0], slots.widths.numpy()[0]
+    scale, seen = gap / GAP, 0
+    corners = (
+        scale * (vertices[faces] - ball.centre),
+        scale * (vertices[faces] @ quaternion_matrix(pose[3:]).T + pose[:3] - ball.centre),
+    )
+    for at, key in enumerate(slots.key.numpy()[:ROOM]):
+        if key == 0 or at % A_BIN < KINDS or at % A_BIN == 2 * KINDS:
+            continue
+        score, name = decode(key, int(of_a + of_b))
+        pair = name >> int(of_b), name & ((1 << int(of_b)) - 1)
+        assert pair in near
+        reach = max(np.linalg.norm(own[face], axis=1).max() for own, face in zip(corners, pair))
+        assert score <= -scale * near[pair] + weight * (reach + gap) + 1e-5
+        seen += 1
+    assert seen > 20
