@@ -204,19 +204,15 @@ def deepest_corner(column: Column, least: wp.float64):
 
 
 @wp.func
-def measure_column(pair: FacePair, n: wp.vec3d, normal_a: wp.vec3d, normal_b: wp.vec3d, least: wp.float64):
-    """Return the column of one face along n, of that which looks more along it, and how deep the other is within it.
-
-    Args:
-        least: Depth from which on corners count: 0, or minus the gap.
-    """
+def make_column(pair: FacePair, n: wp.vec3d, normal_a: wp.vec3d, normal_b: wp.vec3d):
+    """Return the column of one face along n, of that which looks more along it, with NO_DEPTH; whether it looks."""
     column = Column()
     column.normal = n
     column.depth = NO_DEPTH
     facing_a, facing_b = wp.dot(n, normal_a), -wp.dot(n, normal_b)
     other, facing = facing_b > facing_a, wp.max(facing_a, facing_b)
     if facing < FACING:
-        return column
+        return column, False
     column.plane = wp.where(other, normal_b, normal_a) / facing
     column.u0 = wp.where(other, pair.b0, pair.a0)
     column.u1 = wp.where(other, pair.b1, pair.a1)
@@ -231,5 +227,17 @@ def measure_column(pair: FacePair, n: wp.vec3d, normal_a: wp.vec3d, normal_b: wp
     column.side1 = side1
     column.side2 = side2
     column.slack = wp.vec3d(s0, s1, s2)
-    column.depth = deepest_corner(column, least)
+    return column, True
+
+
+@wp.func
+def measure_column(pair: FacePair, n: wp.vec3d, normal_a: wp.vec3d, normal_b: wp.vec3d, least: wp.float64):
+    """Return the column of one face along n, as `make_column`, and how deep the other is within it.
+
+    Args:
+        least: Depth from which on corners count: 0, or minus the gap.
+    """
+    column, looks = make_column(pair, n, normal_a, normal_b)
+    if looks:
+        column.depth = deepest_corner(column, least)
     return column

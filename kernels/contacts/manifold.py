@@ -14,6 +14,7 @@ from warp_abtree.kernels.contacts.column import (
     column_corner,
     column_slack,
     load_pair,
+    make_column,
     measure_column,
 )
 from warp_abtree.kernels.contacts.contact import Contacts
@@ -155,22 +156,27 @@ def measure_crossing(crossing: Crossing, trees: Trees, pose: PairPose, contacts:
         none.normal = loop
         none.depth = NO_DEPTH
         return none
-    if touches_a or touches_b:
-        n = wp.where(touches_a, normal_a, -normal_b)
-        return measure_column(pair, n, normal_a, normal_b, wp.min(least, -slack))
-    best = measure_column(pair, loop, normal_a, normal_b, least)
+    # Of columns only normals and depths are kept: a second one beside the first would not fit into registers.
+    best_n, best_depth = wp.vec3d(loop), -wp.float64(wp.inf)
     toward_a, toward_b = wp.dot(loop, normal_a), -wp.dot(loop, normal_b)
     toward = wp.max(toward_a, toward_b)
     # A loop that runs all round a part in another, as round a thread, has no one way out.
     contrary = FACING <= toward and toward <= LIKENESS and wp.min(toward_a, toward_b) < -FACING
+    touches = touches_a or touches_b
     k = wp.int32(0)
-    while k < 2:
-        m = wp.where(k == 0, normal_a, -normal_b)
-        if contrary or wp.dot(m, loop) > LIKENESS:
-            other = measure_column(pair, m, normal_a, normal_b, wp.min(least, -slack))
-            if other.depth >= -slack and (best.depth < -slack or other.depth <= best.depth + slack):
-                best = other
+    while k < wp.where(touches, 1, 3):
+        n = wp.where(k == 1 or (k == 0 and touches_a), normal_a, -normal_b)
+        if k == 0 and not touches:
+            n = loop
+        if k == 0 or contrary or wp.dot(n, loop) > LIKENESS:
+            tight = k > 0 or touches
+            depth = measure_column(pair, n, normal_a, normal_b, wp.where(tight, wp.min(least, -slack), least)).depth
+            if k == 0 or (depth >= -slack and (best_depth < -slack or depth <= best_depth + slack)):
+                best_n = n
+                best_depth = depth
         k += 1
+    best, _ = make_column(pair, best_n, normal_a, normal_b)
+    best.depth = best_depth
     return best
 
 
