@@ -18,7 +18,7 @@ from warp_abtree.kernels.contacts.column import (
     measure_column,
 )
 from warp_abtree.kernels.contacts.contact import Contacts
-from warp_abtree.kernels.contacts.slots import Slots, WitnessRows, offer_point
+from warp_abtree.kernels.contacts.slots import Slots, WitnessRows, find_bin, no_scores, offer_scores, rate_point
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 
 wp.set_module_options(native.options("contacts/slots.cuh"))
@@ -207,20 +207,20 @@ def offer_crossing_kernel(
     pose = batch.poses[p]
     column = measure_crossing(crossing, trees, pose, contacts, curves)
     sense = wp.where(pose.swapped != 0, wp.float64(-1.0), wp.float64(1.0))
-    n = wp.vec3(sense * column.normal)
     weight, directions = slots_inout.measures[p][1], slots_inout.directions
+    bin, scores = find_bin(wp.vec3(sense * column.normal), directions), no_scores()
+    centre = trees.models.centre[trees.states.model[trees.objects.state[crossing.a]]]
     if column.depth == NO_DEPTH:
         # Behind whatever has a depth.
-        offer_point(n, wp.vec3(), NO_DEPTH_SEPARATION, weight, directions, i, p, slots_inout.key)
-        return
-    centre = trees.models.centre[trees.states.model[trees.objects.state[crossing.a]]]
+        rate_point(wp.vec3(), NO_DEPTH_SEPARATION, weight, bin, directions, scores)
     k = wp.int32(0)
-    while k < POSSIBLE_CORNERS:
+    while k < POSSIBLE_CORNERS and column.depth > NO_DEPTH:
         point, depth, exists = column_corner(column, k)
         if exists and depth >= crossing.least:
             x, s = wp.vec3((point - centre) * pose.scale), wp.float32(-depth * pose.scale)
-            offer_point(n, x, s, weight, directions, i, p, slots_inout.key)
+            rate_point(x, s, weight, bin, directions, scores)
         k += 1
+    offer_scores(scores, bin, i, p, slots_inout.key)
 
 
 @wp.kernel

@@ -24,7 +24,8 @@ struct NearOffer {
         typedef SlotScores<lanes, bits, integers> Base;
         bits inside, counts;
         CUDA_CALLABLE Scores() {}
-        CUDA_CALLABLE Scores(const Vector& n, const float* directions) : Base(n, directions) {}
+        CUDA_CALLABLE Scores(const Vector& n, const float* directions)
+            : Base(Base::find_bin(n, directions), directions) {}
     };
 
     static CUDA_CALLABLE Point unit_normal(const Point (&c)[3]) {

@@ -20,12 +20,10 @@ struct SlotScores {
     static CUDA_CALLABLE L dot(const Vector& u, const Vector& v) {
         return Float32::fuse(u.x, v.x, Float32::fuse(u.y, v.y, u.z * v.z));
     }
-    CUDA_CALLABLE SlotScores() {}
-    // Directions: normals of bins and two vectors across each, by component.
-    CUDA_CALLABLE SlotScores(const Vector& n, const float* directions) {
-        const L none = L{} + NO_SCORE;
-        L best = none;
-        bin = I{};
+    // Nine times the bin of a normal. Directions: normals of bins and two vectors across each, by component.
+    static CUDA_CALLABLE I find_bin(const Vector& n, const float* directions) {
+        L best = L{} + NO_SCORE;
+        I bin = I{};
         for (int k = 0; k < NORMAL_BINS; ++k) {
             const float* d = directions + 9 * k;
             const L cosine = dot(n, Vector{L{} + d[0], L{} + d[1], L{} + d[2]});
@@ -33,12 +31,16 @@ struct SlotScores {
             best = more ? cosine : best;
             bin = more ? I{} + 9 * k : bin;
         }
+        return bin;
+    }
+    CUDA_CALLABLE SlotScores() {}
+    CUDA_CALLABLE SlotScores(const I& bin, const float* directions) : bin(bin) {
         for (int k = 0; k < 2; ++k) {
             const float* d = directions + 3 + 3 * k;
             across[k] = Vector{Float32::pick(d, bin), Float32::pick(d + 1, bin), Float32::pick(d + 2, bin)};
         }
         for (int k = 0; k < SCORES; ++k)
-            score[k] = none;
+            score[k] = L{} + NO_SCORE;
     }
     CUDA_CALLABLE void offer(float weight, const Vector& point, const L& separation, const B& counts) {
         const L x = dot(across[0], point) * weight, y = dot(across[1], point) * weight, depth = -separation;
@@ -88,12 +90,24 @@ inline CUDA_CALLABLE void put_into_slots(wp::int64* slots, const float* scores, 
 #endif
 }
 
-inline CUDA_CALLABLE void offer_point(wp::vec_t<3, wp::float32> normal, wp::vec_t<3, wp::float32> point,
-                                      wp::float32 separation, wp::float32 weight, wp::array_t<wp::float32> directions,
-                                      wp::int32 place, wp::int32 pair, wp::array_t<wp::int64> slots) {
-    typedef SlotScores<float, bool, int> Scores;
-    Scores scores({normal[0], normal[1], normal[2]}, directions.data);
-    scores.offer(weight, {point[0], point[1], point[2]}, separation, true);
-    wp::int64* const slot = slots.data + (wp::int64)pair * SLOT_ROOM + SLOTS_A_BIN * (scores.bin / 9);
-    put_into_slots(slot, scores.score, SCORES, 32, place);
+typedef SlotScores<float, bool, int> PointScores;
+
+inline CUDA_CALLABLE wp::int32 find_bin(wp::vec_t<3, wp::float32> n, wp::array_t<wp::float32> directions) {
+    return PointScores::find_bin({n[0], n[1], n[2]}, directions.data);
+}
+
+inline CUDA_CALLABLE wp::vec_t<SCORES, wp::float32> no_scores() { return wp::vec_t<SCORES, wp::float32>(NO_SCORE); }
+
+inline CUDA_CALLABLE void rate_point(wp::vec_t<3, wp::float32> point, wp::float32 separation, wp::float32 weight,
+                                     wp::int32 bin, wp::array_t<wp::float32> directions,
+                                     wp::vec_t<SCORES, wp::float32>& scores) {
+    PointScores own(bin, directions.data);
+    own.offer(weight, {point[0], point[1], point[2]}, separation, true);
+    for (int k = 0; k < SCORES; ++k)
+        scores[k] = own.score[k] > scores[k] ? own.score[k] : scores[k];
+}
+
+inline CUDA_CALLABLE void offer_scores(wp::vec_t<SCORES, wp::float32> scores, wp::int32 bin, wp::int32 place,
+                                       wp::int32 pair, wp::array_t<wp::int64> slots) {
+    put_into_slots(slots.data + (wp::int64)pair * SLOT_ROOM + SLOTS_A_BIN * (bin / 9), &scores[0], SCORES, 32, place);
 }
