@@ -62,6 +62,7 @@ class Manifolds:
     point: wp.array2d(dtype=wp.vec3d)  # [world units], shape [pair, points]
     normal: wp.array2d(dtype=wp.vec3d)  # unit, from the pair's first object to its second, shape [pair, points]
     depth: wp.array2d(dtype=wp.float64)  # [world units] along the normal, negative if apart, shape [pair, points]
+    witness: wp.array2d(dtype=wp.int32)  # that each is a candidate of, shape [pair, points], or [0, 0] where not kept
 
 
 @wp.func
@@ -180,7 +181,7 @@ def measure_crossing(crossing: Crossing, trees: Trees, pose: PairPose, contacts:
     return best
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=128)
 def offer_crossing_kernel(
     trees: Trees,
     batch: PairBatch,

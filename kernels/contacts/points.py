@@ -229,6 +229,8 @@ def write_in_order(
         manifolds.point[p, place] = point
         manifolds.normal[p, place] = witnesses.normal[number / COLUMN_CORNERS]
         manifolds.depth[p, place] = wp.where(depth == NO_DEPTH, wp.float64(0.0), depth)
+        if manifolds.witness.shape[0] > 0:
+            manifolds.witness[p, place] = number / COLUMN_CORNERS
         k += group_size()
     if group_lane() == 0:
         manifolds.count[p] = count

@@ -320,7 +320,7 @@ class Operator(DeviceMemory):
         for launch in self.find_launches(name, make):
             launch()
 
-    def launch_kernel(self, kernel, dim: int, inputs: list, block_dim=256, given: tuple = ()):
+    def launch_kernel(self, kernel, dim: int | tuple, inputs: list, block_dim=256, given: tuple = ()):
         """Launch a kernel, recorded until the arrays are replaced, or dim or what else is given changes."""
 
         def make(launch):

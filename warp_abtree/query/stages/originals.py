@@ -38,7 +38,7 @@ class Originals:
 
 
 class OriginalStage(Stage):
-    """Move the candidate points of contacts at LODs to the original surfaces.
+    """Move contact points found at LODs to the original surfaces.
 
     Attributes:
         poses: Of the originals of each pair, device `PairPose` (pair,).
@@ -55,10 +55,11 @@ class OriginalStage(Stage):
         """Return the poses."""
         return [Array(self, "poses", PairPose, rooms.pairs)]
 
-    def project(self, some: int, gap: Any, faces: Any, rows: Any, witnesses: Any):
-        """Move the candidates of so many witnesses at most. Launches only."""
+    def project(self, gap: Any, faces: Any, rows: Any, manifolds: Any):
+        """Move the points, of which `manifolds` has the witnesses. Launches only."""
         operator, trees = self.operator, self._finest.trees
-        asked, room = operator.pair_batch, operator.rooms.pairs
-        operator.launch_kernel(originals.pose_original_kernel, room, [trees, asked, self.poses])
-        inputs = [operator.batch.trees, trees, asked, self.poses, gap, faces, operator.hits, rows, witnesses]
-        operator.launch_kernel(originals.project_witness_kernel, some, inputs, WARP_SIZE)
+        asked, room, launch = operator.pair_batch, operator.rooms.pairs, operator.launch_kernel
+        launch(originals.pose_original_kernel, room, [trees, asked, self.poses])
+        inputs = [operator.batch.trees, trees, asked, self.poses, faces, rows, manifolds]
+        launch(originals.project_point_kernel, (room, manifolds.point.shape[1]), inputs, WARP_SIZE)
+        launch(originals.drop_apart_kernel, room, [asked, gap, manifolds])

@@ -101,6 +101,7 @@ class PointStage(Stage):
     ):
         self._memory: MemoryStage | None = memory
         self._originals: OriginalStage | None = originals
+        self._kept = {} if originals is None else {"witness": wp.int32}
         self._slots, self._contacts, self._with_gap, self.point_max = slots, contacts, with_gap, point_max
         self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
         self.witnesses, self.near = manifold.Witnesses(), contact.Contacts()
@@ -122,7 +123,7 @@ class PointStage(Stage):
             Array(witnesses, "wrench", wp.vec4, 2 * CANDIDATES * room),
             *(near if self._with_gap else []),
             Array(self.manifolds, "count", wp.int32, rooms.pairs, 0),
-            *fields(self.manifolds, (rooms.pairs, self.point_max), **POINT_FIELDS),
+            *fields(self.manifolds, (rooms.pairs, self.point_max), **POINT_FIELDS, **self._kept),
         ]
 
     def search(self):
@@ -145,9 +146,9 @@ class PointStage(Stage):
             launch(near_points.find_near_witness_kernel, some, [*posed, *found, self.near, self.witnesses], WARP_SIZE)
             inputs = [*posed[:2], *found, self.near, self.witnesses]
             launch(nearest_contacts.keep_nearest_kernel, some, inputs, WARP_SIZE)
-        if self._originals is not None:
-            self._originals.project(some, gap, self._contacts.faces, self._slots.rows, self.witnesses)
         self._choose_points([operator.batch.objects.pool, operator.pair_batch, self._twists, gap])
+        if self._originals is not None:
+            self._originals.project(gap, self._contacts.faces, self._slots.rows, self.manifolds)
         self._add_inside_points()
         if self._memory is not None:
             self._memory.keep(self.manifolds)
@@ -216,9 +217,9 @@ class ManifoldQuery(Operator):
             so that a point is missing only if it came nearer by that. True: an eighth of the gap, at most
             2^-11 of the smaller object's size, half of its box's diagonal. It needs a gap. Results then depend on the
             launches before, in the same way on every device, until `forget`. None: every launch searches every pair.
-        originals: Whether candidates found at LODs are moved to the original surfaces before points are chosen: to the
-            middle of the points of either that are nearest, with their depth along the normal of the LODs. Whether
-            a pair intersects, and what is inside solids, stays that of the LODs.
+        originals: Whether points found at LODs are moved to the original surfaces: to the middle of those points of
+            either that are nearest, with their depth along the normal of the LODs. Whether a pair intersects, and what
+            is inside solids, stays that of the LODs.
 
     Attributes:
         manifolds: Points of each pair, device arrays (pair capacity, points) of `kernels.contacts.manifold.Manifolds`.
