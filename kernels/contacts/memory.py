@@ -7,6 +7,9 @@ and is as much less deep as they have come apart along its normal, which turns w
 lacks is a point that came nearer by that distance at most. The motion counts from the search, not from the last launch,
 so that slow motions add up.
 
+A point of a pair that was searched again is one of those before if it is the nearest to it and the other way round, no
+farther than `MATCH_SHARE` of the smaller object's size, with normals within 60 degrees.
+
 What a launch finds then depends on those before it, in the same way on every device. There are two tables, by turns:
 one is read, and the other written, in the order of the launch's pairs. Source of contacts as a point of either body:
 the persistent manifolds of physics engines, such as Bullet's and PhysX's.
@@ -16,17 +19,20 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees, pair_key
+from warp_abtree.kernels.base.lanes import next_place, warp_lane, warp_size
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import PairBatch, pose_point, relative_pose
 from warp_abtree.kernels.contacts.manifold import Manifolds
 from warp_abtree.kernels.contacts.slots import tree_size
 from warp_abtree.kernels.intersect.face_pairs import Hits, is_whole
 
-wp.set_module_options(native.options())
+wp.set_module_options(native.options("base/lanes.cuh"))
 
 # Unless told otherwise a pair rests within this part of its gap, and of its smaller object's size: half of its box's
 # diagonal, so that wide gaps do not hide what comes.
 GAP_SHARE, SIZE_SHARE = wp.constant(wp.float64(2.0**-3)), wp.constant(wp.float64(2.0**-11))
+# Part of the smaller object's size that a point may have moved to be the same.
+MATCH_SHARE, MATCH_COSINE = wp.constant(wp.float64(2.0**-5)), wp.constant(wp.float64(0.5))
 
 
 @wp.struct
@@ -46,6 +52,7 @@ class PointMemory:
     point_b: wp.array3d(dtype=wp.vec3d)  # [units of B's model], B's frame, shape [2, pair, points]
     normal: wp.array3d(dtype=wp.vec3d)  # from the pair's first object to its second, A's frame, shape [2, pair, points]
     depth: wp.array3d(dtype=wp.float64)  # [world units] then, shape [2, pair, points]
+    shown: wp.array3d(dtype=wp.int32)  # place among those of the last launch, -1 for none, shape [2, pair, points]
 
 
 @wp.struct
@@ -79,6 +86,12 @@ def lods_of(trees: Trees, pair: wp.vec2i):
         trees.states.lod[trees.objects.state[pair[0]]],
         trees.states.lod[trees.objects.state[pair[1]]],
     )
+
+
+@wp.func
+def smaller_size(trees: Trees, a: wp.int32, b: wp.int32):
+    """Return half of the diagonal of the box of the smaller of two objects."""
+    return wp.min(tree_size(trees, trees.objects.state[a]), tree_size(trees, trees.objects.state[b]))
 
 
 @wp.func
@@ -116,6 +129,7 @@ def find_resting_kernel(
     batch: PairBatch,
     gap: wp.array(dtype=wp.float64),
     memory: PointMemory,
+    row_out: wp.array(dtype=wp.int32),
     place_out: wp.array(dtype=wp.int32),
     asked_out: wp.array(dtype=wp.float64),
 ):
@@ -123,7 +137,8 @@ def find_resting_kernel(
 
     Args:
         gap: Of each pair [world units], shape [pair].
-        place_out: Its place in the table that is read, -1 for a pair that is to be searched, shape [pair].
+        row_out: Its place in the table that is read, -1 where it is not there, shape [pair].
+        place_out: The same, but -1 for a pair that is to be searched, shape [pair].
         asked_out: What the traversal takes as gap: -inf for a pair that rests, shape [pair].
     """
     p = wp.tid()
@@ -133,6 +148,7 @@ def find_resting_kernel(
     asked_out[p] = gap[p]
     pair, turn = batch.pairs[p], memory.turn[0]
     m = find_remembered(p, pair, rest, memory)
+    row_out[p] = m
     if m < 0:
         return
     if not (memory.lods[turn, m] == lods_of(trees, pair)):
@@ -140,8 +156,7 @@ def find_resting_kernel(
     a, b = wp.min(pair[0], pair[1]), wp.max(pair[0], pair[1])
     limit = wp.float64(rest.distance)
     if limit < wp.float64(0.0):
-        size = wp.min(tree_size(trees, trees.objects.state[a]), tree_size(trees, trees.objects.state[b]))
-        limit = wp.min(GAP_SHARE * gap[p], SIZE_SHARE * size)
+        limit = wp.min(GAP_SHARE * gap[p], SIZE_SHARE * smaller_size(trees, a, b))
     moved = farthest_motion(trees, a, b, memory.rotation[turn, m], memory.translation[turn, m])
     if moved + wp.max(gap[p] - memory.gap[turn, m], wp.float64(0.0)) <= limit:
         place_out[p] = m
@@ -161,6 +176,19 @@ def resume_resting_kernel(batch: PairBatch, place: wp.array(dtype=wp.int32), mem
 
 
 @wp.func
+def recall_point(trees: Trees, batch: PairBatch, p: wp.int32, m: wp.int32, k: wp.int32, memory: PointMemory):
+    """Return where point k of row m is now, of pair p, with its normal and its depth."""
+    turn, pair = memory.turn[0], batch.pairs[p]
+    a, b = wp.min(pair[0], pair[1]), wp.max(pair[0], pair[1])
+    rotation = trees.objects.rotation[a]
+    of_a = pose_point(rotation, trees.objects.position[a], memory.point_a[turn, m, k])
+    of_b = pose_point(trees.objects.rotation[b], trees.objects.position[b], memory.point_b[turn, m, k])
+    n = rotation * memory.normal[turn, m, k]
+    sense = wp.where(pair[0] == a, wp.float64(1.0), wp.float64(-1.0))
+    return wp.float64(0.5) * (of_a + of_b), n, memory.depth[turn, m, k] + sense * wp.dot(of_a - of_b, n)
+
+
+@wp.func
 def recall_points(
     p: wp.int32,
     m: wp.int32,
@@ -170,45 +198,81 @@ def recall_points(
     memory: PointMemory,
     manifolds: Manifolds,
 ):
-    """Write the points of a pair that rests, place m in the table that is read, but those that are a gap apart."""
-    turn, found = memory.turn[0], wp.int32(0)
-    a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
-    rotation, position = trees.objects.rotation[a], trees.objects.position[a]
-    sense = wp.where(batch.pairs[p][0] == a, wp.float64(1.0), wp.float64(-1.0))
-    for k in range(memory.count[turn, m]):
-        of_a = pose_point(rotation, position, memory.point_a[turn, m, k])
-        of_b = pose_point(trees.objects.rotation[b], trees.objects.position[b], memory.point_b[turn, m, k])
-        n = rotation * memory.normal[turn, m, k]
-        depth = memory.depth[turn, m, k] + sense * wp.dot(of_a - of_b, n)
-        if depth > -gap:
-            manifolds.point[p, found] = wp.float64(0.5) * (of_a + of_b)
-            manifolds.normal[p, found] = n
-            manifolds.depth[p, found] = depth
-            found += 1
-    manifolds.count[p] = found
+    """Write the points of a pair that rests, row m of the table that is read, but those a gap apart, by a warp.
+
+    What is known of the pair is copied to the other table.
+    """
+    turn, found, k = memory.turn[0], wp.int32(0), warp_lane()
+    other, count = 1 - turn, memory.count[turn, m]
+    while k - warp_lane() < count:
+        j = wp.min(k, count - 1)
+        point, n, depth = recall_point(trees, batch, p, m, j, memory)
+        shows = k < count and depth > -gap
+        place = next_place(found, shows)
+        if shows:
+            manifolds.point[p, place] = point
+            manifolds.normal[p, place] = n
+            manifolds.depth[p, place] = depth
+            manifolds.before[p, place] = memory.shown[turn, m, j]
+        if k < count:
+            memory.point_a[other, p, j] = memory.point_a[turn, m, j]
+            memory.point_b[other, p, j] = memory.point_b[turn, m, j]
+            memory.normal[other, p, j] = memory.normal[turn, m, j]
+            memory.depth[other, p, j] = memory.depth[turn, m, j]
+            memory.shown[other, p, j] = wp.where(shows, place, -1)
+        k += warp_size()
+    if warp_lane() == 0:
+        manifolds.count[p] = found
+        memory.lods[other, p] = memory.lods[turn, m]
+        memory.gap[other, p] = memory.gap[turn, m]
+        memory.rotation[other, p] = memory.rotation[turn, m]
+        memory.translation[other, p] = memory.translation[turn, m]
+        memory.any_hit[other, p] = memory.any_hit[turn, m]
+        memory.count[other, p] = count
 
 
 @wp.func
-def keep_points(p: wp.int32, m: wp.int32, memory: PointMemory):
-    """Copy what is known of a pair that rests, place m in the table that is read, to place p in the other."""
-    turn = memory.turn[0]
-    other = 1 - turn
-    memory.lods[other, p] = memory.lods[turn, m]
-    memory.gap[other, p] = memory.gap[turn, m]
-    memory.rotation[other, p] = memory.rotation[turn, m]
-    memory.translation[other, p] = memory.translation[turn, m]
-    memory.any_hit[other, p] = memory.any_hit[turn, m]
-    memory.count[other, p] = memory.count[turn, m]
-    for k in range(memory.count[turn, m]):
-        memory.point_a[other, p, k] = memory.point_a[turn, m, k]
-        memory.point_b[other, p, k] = memory.point_b[turn, m, k]
-        memory.normal[other, p, k] = memory.normal[turn, m, k]
-        memory.depth[other, p, k] = memory.depth[turn, m, k]
+def match_point(
+    p: wp.int32,
+    m: wp.int32,
+    k: wp.int32,
+    trees: Trees,
+    batch: PairBatch,
+    memory: PointMemory,
+    manifolds: Manifolds,
+):
+    """Return the place in the launch before of point k of a pair that was searched, -1 for a new one.
+
+    Args:
+        m: Row of the pair in the table that is read, or -1.
+    """
+    if m < 0:
+        return wp.int32(-1)
+    turn, nearest, x = memory.turn[0], wp.int32(-1), manifolds.point[p, k]
+    reach = MATCH_SHARE * smaller_size(trees, batch.pairs[p][0], batch.pairs[p][1])
+    least = reach * reach
+    for j in range(memory.count[turn, m]):
+        point, n, _depth = recall_point(trees, batch, p, m, j, memory)
+        far = wp.dot(point - x, point - x)
+        if memory.shown[turn, m, j] >= 0 and far < least and wp.dot(n, manifolds.normal[p, k]) > MATCH_COSINE:
+            least = far
+            nearest = j
+    if nearest < 0:
+        return wp.int32(-1)
+    point, _normal, _depth = recall_point(trees, batch, p, m, nearest, memory)
+    for other in range(manifolds.count[p]):
+        v = manifolds.point[p, other] - point
+        if wp.dot(v, v) < least or (wp.dot(v, v) == least and other < k):
+            nearest = wp.int32(-1)
+    if nearest >= 0:
+        nearest = memory.shown[turn, m, nearest]
+    return nearest
 
 
 @wp.func
 def note_points(
     p: wp.int32,
+    m: wp.int32,
     gap: wp.float64,
     any_hit: wp.int32,
     trees: Trees,
@@ -216,22 +280,30 @@ def note_points(
     manifolds: Manifolds,
     memory: PointMemory,
 ):
-    """Write what was found of a pair that was searched to the table that is not read."""
-    other = 1 - memory.turn[0]
+    """Write what was found of a pair that was searched to the table that is not read, by a warp.
+
+    Args:
+        m: As for `match_point`.
+    """
+    other, k = 1 - memory.turn[0], warp_lane()
     a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
-    rotation, translation = relative_pose(trees.objects, a, b)
     back_a, back_b = wp.transpose(trees.objects.rotation[a]), wp.transpose(trees.objects.rotation[b])
-    memory.lods[other, p] = lods_of(trees, batch.pairs[p])
-    memory.gap[other, p] = gap
-    memory.rotation[other, p] = rotation
-    memory.translation[other, p] = translation
-    memory.any_hit[other, p] = any_hit
-    memory.count[other, p] = manifolds.count[p]
-    for k in range(manifolds.count[p]):
+    while k < manifolds.count[p]:
+        manifolds.before[p, k] = match_point(p, m, k, trees, batch, memory, manifolds)
         memory.point_a[other, p, k] = back_a * (manifolds.point[p, k] - trees.objects.position[a])
         memory.point_b[other, p, k] = back_b * (manifolds.point[p, k] - trees.objects.position[b])
         memory.normal[other, p, k] = back_a * manifolds.normal[p, k]
         memory.depth[other, p, k] = manifolds.depth[p, k]
+        memory.shown[other, p, k] = k
+        k += warp_size()
+    if warp_lane() == 0:
+        rotation, translation = relative_pose(trees.objects, a, b)
+        memory.lods[other, p] = lods_of(trees, batch.pairs[p])
+        memory.gap[other, p] = gap
+        memory.rotation[other, p] = rotation
+        memory.translation[other, p] = translation
+        memory.any_hit[other, p] = any_hit
+        memory.count[other, p] = manifolds.count[p]
 
 
 @wp.kernel
@@ -239,26 +311,26 @@ def keep_points_kernel(
     trees: Trees,
     batch: PairBatch,
     gap: wp.array(dtype=wp.float64),
+    row: wp.array(dtype=wp.int32),
     place: wp.array(dtype=wp.int32),
     hits: Hits,
     manifolds_inout: Manifolds,
     memory_inout: PointMemory,
 ):
-    """Take the points of one object pair a thread from the memory, if it rests; write what is known to the other table.
+    """Take the points of one object pair a warp from the memory, if it rests; write what is known to the other table.
 
     Args:
-        gap, place: As for `find_resting_kernel`.
+        gap, row, place: As for `find_resting_kernel`.
     """
-    p = wp.tid()
+    p = wp.tid() / warp_size()
     if p >= wp.min(batch.count[0], batch.pairs.shape[0]):
         return
-    memory_inout.pairs[1 - memory_inout.turn[0], p] = batch.pairs[p]
-    m = place[p]
-    if m >= 0:
-        recall_points(p, m, gap[p], trees, batch, memory_inout, manifolds_inout)
-        keep_points(p, m, memory_inout)
+    if warp_lane() == 0:
+        memory_inout.pairs[1 - memory_inout.turn[0], p] = batch.pairs[p]
+    if place[p] >= 0:
+        recall_points(p, place[p], gap[p], trees, batch, memory_inout, manifolds_inout)
     else:
-        note_points(p, gap[p], hits.any_hit[p], trees, batch, manifolds_inout, memory_inout)
+        note_points(p, row[p], gap[p], hits.any_hit[p], trees, batch, manifolds_inout, memory_inout)
 
 
 @wp.kernel

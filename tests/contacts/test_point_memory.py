@@ -148,9 +148,44 @@ def test_slow_motions_add_up(device):
 
 
 def same_points(points, others):
-    assert points.keys() == others.keys()
-    for name, values in points.items():
-        assert np.ascontiguousarray(values).tobytes() == np.ascontiguousarray(others[name]).tobytes()
+    assert points.keys() == {*others.keys(), "before"}
+    for name, values in others.items():
+        assert np.ascontiguousarray(values).tobytes() == np.ascontiguousarray(points[name]).tobytes()
+
+
+def test_points_know_their_place_in_the_launch_before(device):
+    """Of pairs that rest and of those that are searched: mutual nearest points, in NumPy, as objects have moved."""
+    rng, (scene, query) = np.random.default_rng(6), make(device)
+    reach, pose, last, kinds = 2.0**-5 * 0.5 * 3**0.5, posed(rng, 0.01, 0.02), None, set()
+    for step in range(40):
+        scene.set_poses([FLOOR, pose])
+        points = query.run().points
+        if last is None:
+            expected = np.full(len(points["depth"]), -1)
+        else:
+            # Where each of the last launch is now: the middle of what moved with either.
+            moved = 0.5 * (last[1] + place(pose, see(last[0], last[1])))
+            far = np.linalg.norm(points["point"][:, None] - moved[None], axis=2)
+            alike = (points["normal"] @ last[2].T > 0.5) & (far < reach)
+            # That the nearest of a place may be a point of another normal counts, too.
+            nearest = np.where(alike, far, np.inf).argmin(1)
+            found = alike.any(1) & (far.argmin(0)[nearest] == np.arange(len(far)))
+            expected = np.where(found, nearest, -1)
+        resting = bool(is_resting(query)[0])
+        if not resting or step == 0:
+            assert points["before"].tolist() == expected.tolist()
+        else:
+            # As many points as before or fewer, in their order, those that are a gap apart gone.
+            assert (np.diff(points["before"]) > 0).all() and (points["before"] >= 0).all()
+            np.testing.assert_allclose(points["point"], moved[points["before"]], atol=2 * REST)
+        kinds.add((resting, bool((points["before"] < 0).any())))
+        last = pose.copy(), points["point"], points["normal"]
+        pose = pose.copy()
+        pose[:2] += rng.normal(size=2) * (0.2 * REST if step % 3 else 2 * REST)
+        pose[3:] = multiply(about(rng.normal(size=3), 0.001), pose[3:])
+    assert {(True, False), (False, False), (False, True)} <= kinds
+    query.forget()
+    assert (query.run().points["before"] == -1).all()
 
 
 def test_lods_gaps_and_pairs_that_are_others_are_searched(device):

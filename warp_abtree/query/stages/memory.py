@@ -8,11 +8,12 @@ import warp as wp
 from warp_abtree.checks.arguments import positive
 from warp_abtree.kernels.contacts import memory
 from warp_abtree.query.operator import Operator
-from warp_abtree.query.stage import Array, Rooms, Stage
+from warp_abtree.query.stage import Array, Rooms, Stage, fields
 
 TABLE_PAIRS = {"pairs": wp.vec2i, "lods": wp.vec2i, "gap": wp.float64, "rotation": wp.mat33d, "translation": wp.vec3d}
 TABLE_PAIRS |= {"any_hit": wp.int32, "count": wp.int32}
 TABLE_POINTS = {"point_a": wp.vec3d, "point_b": wp.vec3d, "normal": wp.vec3d, "depth": wp.float64}
+TABLE_POINTS |= {"shown": wp.int32}
 
 
 def check_remember(remember, gap) -> float | None:
@@ -44,9 +45,11 @@ class MemoryStage(Stage):
 
     Attributes:
         memory: Device arrays, `kernels.contacts.memory.PointMemory`.
-        place, asked: Of each pair, its place in the memory, and the gap to traverse it with, see `find_resting_kernel`.
+        row, place, asked: Of each pair, its row in the memory, the same if it rests, and the gap to traverse it with,
+            see `find_resting_kernel`.
     """
 
+    row: wp.array
     place: wp.array
     asked: wp.array
 
@@ -62,7 +65,7 @@ class MemoryStage(Stage):
 
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return both tables, which keep what they hold where there is more room, and what has an entry a pair."""
-        made = [Array(self, "place", wp.int32, rooms.pairs), Array(self, "asked", wp.float64, rooms.pairs)]
+        made = fields(self, rooms.pairs, row=wp.int32, place=wp.int32, asked=wp.float64)
         for names, shape in ((TABLE_PAIRS, ()), (TABLE_POINTS, (self._points,))):
             for name, dtype in names.items():
                 copy = partial(_copy_table, getattr(self.memory, name))
@@ -73,7 +76,8 @@ class MemoryStage(Stage):
         """Find the pairs that rest. Launches only."""
         operator = self.operator
         inputs = [self._rest, operator.batch.trees, operator.pair_batch, operator.hits.gap, self.memory]
-        operator.launch_kernel(memory.find_resting_kernel, operator.rooms.pairs, [*inputs, self.place, self.asked])
+        inputs += [self.row, self.place, self.asked]
+        operator.launch_kernel(memory.find_resting_kernel, operator.rooms.pairs, inputs)
 
     def resume(self):
         """Say which of the pairs that rest intersect. Launches only, after what decides that of the others."""
@@ -83,8 +87,8 @@ class MemoryStage(Stage):
     def keep(self, manifolds: Any):
         """Give the pairs that rest their points, and keep those of the others. Launches only."""
         operator, hits = self.operator, self.operator.hits
-        posed = [operator.batch.trees, operator.pair_batch, hits.gap, self.place]
-        operator.launch_kernel(memory.keep_points_kernel, operator.rooms.pairs, [*posed, hits, manifolds, self.memory])
+        inputs = [operator.batch.trees, operator.pair_batch, hits.gap, self.row, self.place, hits]
+        operator.launch_warps(memory.keep_points_kernel, operator.rooms.pairs, [*inputs, manifolds, self.memory])
         operator.launch_kernel(memory.turn_memory_kernel, 1, [operator.pair_batch, hits, self.memory])
 
     def forget(self):

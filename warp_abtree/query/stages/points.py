@@ -102,6 +102,7 @@ class PointStage(Stage):
         self._memory: MemoryStage | None = memory
         self._originals: OriginalStage | None = originals
         self._kept = {} if originals is None else {"witness": wp.int32}
+        self._fields = POINT_FIELDS if memory is None else {**POINT_FIELDS, "before": wp.int32}
         self._slots, self._contacts, self._with_gap, self.point_max = slots, contacts, with_gap, point_max
         self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
         self.witnesses, self.near = manifold.Witnesses(), contact.Contacts()
@@ -123,7 +124,7 @@ class PointStage(Stage):
             Array(witnesses, "wrench", wp.vec4, 2 * CANDIDATES * room),
             *(near if self._with_gap else []),
             Array(self.manifolds, "count", wp.int32, rooms.pairs, 0),
-            *fields(self.manifolds, (rooms.pairs, self.point_max), **POINT_FIELDS, **self._kept),
+            *fields(self.manifolds, (rooms.pairs, self.point_max), **self._fields, **self._kept),
         ]
 
     def search(self):
@@ -192,7 +193,7 @@ class PointStage(Stage):
         if not with_rows:
             return
         pairs = len(found.pairs)
-        arrays = {name: first_rows(getattr(self.manifolds, name), pairs) for name in ("count", *POINT_FIELDS)}
+        arrays = {name: first_rows(getattr(self.manifolds, name), pairs) for name in ("count", *self._fields)}
         if device:
             found.points = {name: wp.clone(array) for name, array in arrays.items()}
             return
@@ -223,6 +224,8 @@ class ManifoldQuery(Operator):
 
     Attributes:
         manifolds: Points of each pair, device arrays (pair capacity, points) of `kernels.contacts.manifold.Manifolds`.
+            With `remember` also `before`, the place that each point had among its pair's in the launch before, -1 for a
+            new one: what warm starting needs. Results have it as `points["before"]`.
         contacts: Contacts of faces that cross, as of `ContactQuery`, without separations; faces and start as there.
         curves: Loops of these contacts, device arrays (capacity,) of `kernels.contacts.manifold.Curves`.
         witness_rows: Face pairs that the slots of each pair keep, those of pair p at start[p] to start[p] + count[p],
