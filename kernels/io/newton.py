@@ -169,3 +169,58 @@ def write_contact_kernel(
             contacts_out.margin0[at] = margin[shape0]
             contacts_out.margin1[at] = margin[shape1]
         k += 1
+
+
+@wp.struct
+class Matching:
+    """Which contacts are those of the launch before, where a buffer of Newton's asks for it."""
+
+    row: wp.array(dtype=wp.int32)  # place of each pair among those of the launch before, -1 for none, shape [pair]
+    start: wp.array(dtype=wp.int32)  # where the contacts of pairs of the launch before began, shape [pair]
+    next_start: wp.array(dtype=wp.int32)  # where those of this one begin, shape [pair]
+    buffer: wp.array(dtype=wp.int64)  # address of the contacts of the launch before, shape [1]
+    generation: wp.array(dtype=wp.int32)  # of the contacts, before they were cleared, shape [1]
+
+
+@wp.kernel
+def match_contact_kernel(
+    buffer: wp.int64,
+    first: wp.array(dtype=wp.int32),
+    batch: PairBatch,
+    manifolds: Manifolds,
+    end: wp.array(dtype=wp.int32),
+    count: wp.array(dtype=wp.int32),
+    matching_inout: Matching,
+    index_out: wp.array(dtype=wp.int32),
+    generation_out: wp.array(dtype=wp.int32),
+):
+    """Write which contact of the buffer's last contents each point of one pair a thread is, -1 for a new one.
+
+    Args:
+        buffer: Address of the contacts.
+        first, end, count: As for `write_contact_kernel`.
+        index_out, generation_out: The buffer's match indices, and the generation that they refer to, -1 for none.
+    """
+    p = wp.tid()
+    known, start = matching_inout.buffer[0] == buffer, first[0] + end[p] - count[p]
+    matching_inout.next_start[p] = start
+    if p == 0:
+        generation_out[0] = wp.where(known, matching_inout.generation[0], -1)
+    if p >= batch.count[0]:
+        return
+    row = matching_inout.row[p]
+    for k in range(count[p]):
+        before = wp.int32(-1)
+        if known and row >= 0 and manifolds.before[p, k] >= 0:
+            before = matching_inout.start[row] + manifolds.before[p, k]
+        if start + k < index_out.shape[0]:
+            index_out[start + k] = before
+
+
+@wp.kernel
+def keep_start_kernel(buffer: wp.int64, matching_inout: Matching):
+    """Note where the contacts of each pair begin in a buffer, for the next launch."""
+    p = wp.tid()
+    matching_inout.start[p] = matching_inout.next_start[p]
+    if p == 0:
+        matching_inout.buffer[0] = buffer

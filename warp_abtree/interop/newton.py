@@ -121,6 +121,10 @@ class NewtonContacts(DeviceMemory):
     What a mesh changes in place, such as its vertices, is not noticed. A captured graph reads the arrays that it was
     captured with: change `shape_transform` in place.
 
+    Contacts that have match indices (`newton.Contacts(contact_matching=True)`, as those of `contacts` have where all
+    shapes are meshes) are told which contact of their last contents each is, for solvers that warm start by these;
+    `remember` must be on. Contacts of Newton's own pipeline count as new ones.
+
     Args:
         model: `newton.Model`.
         models: `Model` by shape index, to replace the shape's mesh, for example by one built before; in the shape's
@@ -243,8 +247,11 @@ class NewtonContacts(DeviceMemory):
 
     def _grow(self):
         room = len(self.query.pairs)
-        self._count = wp.zeros(room, dtype=wp.int32, device=self.device)
-        self._end = wp.zeros(room, dtype=wp.int32, device=self.device)
+        self._count, self._end = (wp.zeros(room, dtype=wp.int32, device=self.device) for _ in range(2))
+        self._matching = matching = kernels.Matching()
+        matching.start, matching.next_start = (wp.zeros(room, dtype=wp.int32, device=self.device) for _ in range(2))
+        matching.generation = wp.zeros(1, dtype=wp.int32, device=self.device)
+        matching.buffer = wp.zeros(1, dtype=wp.int64, device=self.device)  # that of none
 
     def contacts(self, rigid_contact_max=None):
         """Return an empty `newton.Contacts`; by default with room for all points of each pair."""
@@ -253,7 +260,8 @@ class NewtonContacts(DeviceMemory):
             others = min(len(self._pairs_of_others), OTHERS_MAX)
             room = self.query.point_max * len(self.query.pairs) + POINTS_MAX * others
         if not self._has_others:
-            return self.newton.Contacts(room, 0, device=self.device)
+            matching = self.query.memory is not None
+            return self.newton.Contacts(room, 0, device=self.device, contact_matching=matching)
         self._make_others(room)
         return self.others.contacts()
 
@@ -323,6 +331,9 @@ class NewtonContacts(DeviceMemory):
         wp.launch(kernels.pose_object_kernel, len(self.shapes), inputs, device=self.device)
 
     def _write(self, state, contacts):
+        index = None if self.query.memory is None else contacts.rigid_contact_match_index
+        if index is not None:
+            wp.copy(self._matching.generation, contacts.contact_generation)
         if self.others is None:
             contacts.clear()
         else:
@@ -342,3 +353,17 @@ class NewtonContacts(DeviceMemory):
         inputs = [self._first, self.model.shape_margin, self._ids, body_q, self.model.shape_body]
         inputs += [query.pair_batch, query.manifolds, self._end, self._count, rigid]
         wp.launch(kernels.write_contact_kernel, room, inputs, device=self.device)
+        self._match(contacts, index)
+
+    def _match(self, contacts, index):
+        """Write which contacts are those of the launch before, where these have match indices."""
+        matching = self._matching
+        if index is None:
+            matching.buffer.zero_()
+            return
+        query, room, buffer = self.query, len(self._count), contacts.rigid_contact_shape0.ptr
+        matching.row = query.memory.row
+        inputs = [buffer, self._first, query.pair_batch, query.manifolds, self._end, self._count, matching, index]
+        inputs.append(contacts.rigid_contact_match_generation)
+        wp.launch(kernels.match_contact_kernel, room, inputs, device=self.device)
+        wp.launch(kernels.keep_start_kernel, room, [buffer, matching], device=self.device)
