@@ -62,7 +62,7 @@ class Manifolds:
     point: wp.array2d(dtype=wp.vec3d)  # [world units], shape [pair, points]
     normal: wp.array2d(dtype=wp.vec3d)  # unit, from the pair's first object to its second, shape [pair, points]
     depth: wp.array2d(dtype=wp.float64)  # [world units] along the normal, negative if apart, shape [pair, points]
-    before: wp.array2d(dtype=wp.int32)  # place a launch before, -1 if new, shape [pair, points], or [0, 0]
+    before: wp.array2d(dtype=wp.int32)  # place a launch before, -1 if new, shape [pair, points],
     # or [0, 0] where nothing is kept between launches
     witness: wp.array2d(dtype=wp.int32)  # that each is a candidate of, shape [pair, points], or [0, 0] where not kept
 
