@@ -19,30 +19,34 @@ wp.set_module_options(native.options())
 NEARER = wp.constant(wp.float64(0.999))
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=128)
 def keep_nearest_kernel(
     trees: Trees, batch: PairBatch, hits: Hits, rows: WitnessRows, contacts: Contacts, witnesses_inout: Witnesses
 ):
-    """Drop the candidates of a witness if a face of one object is nearer to its points than its faces are.
+    """Drop the candidates of a witness a thread if a face of either object is nearer to its points than its faces are.
 
-    By branch and bound over the tree of that object, about the nearest point of the other: a thread for either.
+    By branch and bound over the tree of either object, about the nearest point of the other.
     """
-    w, k = wp.tid() / 2, wp.tid() % 2
+    w = wp.tid()
     if w >= wp.min(hits.witness_total[0], rows.item.shape[0]):
         return
-    # Where the other thread has dropped them already, there is nothing left to do.
-    if witnesses_inout.nearest_only[w] == 0 or wp.isnan(witnesses_inout.depth[w, 0]):
+    if witnesses_inout.nearest_only[w] == 0:
         return
     p = rows.item[w][0] & PAIR_MASK
     pose = batch.poses[p]
     a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
     scaling = make_scale(trees, pose, a, b)
     back, position = wp.transpose(trees.objects.rotation[a]), trees.objects.position[a]
-    near, of_b = NEARER * contacts.separation[w], k != pose.swapped
-    own = trees.objects.state[wp.where(of_b, b, a)]
-    point = back * (wp.where(k == 0, contacts.p1[w], contacts.p0[w]) - position)
-    solid = make_solid(trees, pose, scaling, of_b, own)
-    nearest, _ = nearest_face(trees, pose, solid, point, rows.item[w][1 + k], near)
-    if nearest < near:
-        for j in range(COLUMN_CORNERS):
-            witnesses_inout.depth[w, j] = NO_POINT
+    near = NEARER * contacts.separation[w]
+    k = wp.int32(0)
+    while k < 2:
+        of_b = k != pose.swapped
+        own = trees.objects.state[wp.where(of_b, b, a)]
+        point = back * (wp.where(k == 0, contacts.p1[w], contacts.p0[w]) - position)
+        solid = make_solid(trees, pose, scaling, of_b, own)
+        nearest, _ = nearest_face(trees, pose, solid, point, rows.item[w][1 + k], near)
+        if nearest < near:
+            for j in range(COLUMN_CORNERS):
+                witnesses_inout.depth[w, j] = NO_POINT
+            k = wp.int32(2)
+        k += 1

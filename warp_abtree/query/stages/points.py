@@ -146,7 +146,7 @@ class PointStage(Stage):
         if self._with_gap:
             launch(near_points.find_near_witness_kernel, some, [*posed, *found, self.near, self.witnesses], WARP_SIZE)
             inputs = [*posed[:2], *found, self.near, self.witnesses]
-            launch(nearest_contacts.keep_nearest_kernel, 2 * some, inputs, WARP_SIZE)
+            launch(nearest_contacts.keep_nearest_kernel, some, inputs, WARP_SIZE)
         self._choose_points([operator.batch.objects.pool, operator.pair_batch, self._twists, gap])
         if self._originals is not None:
             self._originals.project(gap, self._contacts.faces, self._slots.rows, self.manifolds)
