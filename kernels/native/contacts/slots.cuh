@@ -92,8 +92,8 @@ inline CUDA_CALLABLE void put_into_slots(wp::int64* slots, const float* scores, 
 
 typedef SlotScores<float, bool, int> PointScores;
 
-inline CUDA_CALLABLE wp::int32 find_bin(wp::vec_t<3, wp::float32> n, wp::array_t<wp::float32> directions) {
-    return PointScores::find_bin({n[0], n[1], n[2]}, directions.data);
+inline CUDA_CALLABLE wp::int32 find_bin(wp::vec_t<3, wp::float32> normal, wp::array_t<wp::float32> directions) {
+    return PointScores::find_bin({normal[0], normal[1], normal[2]}, directions.data);
 }
 
 inline CUDA_CALLABLE wp::vec_t<SCORES, wp::float32> no_scores() { return wp::vec_t<SCORES, wp::float32>(NO_SCORE); }

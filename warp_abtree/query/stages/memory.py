@@ -1,4 +1,4 @@
-"""Witness memory between launches: which pairs rest, and what is kept of the others (`kernels.contacts.memory`)."""
+"""Contact points kept between launches: which object pairs rest, and what they keep (`kernels.contacts.memory`)."""
 
 from functools import partial
 from typing import Any
@@ -10,10 +10,10 @@ from warp_abtree.kernels.contacts import memory
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
 
-TABLE_PAIRS = {"pairs": wp.vec2i, "lods": wp.vec2i, "gap": wp.float64, "rotation": wp.mat33d, "translation": wp.vec3d}
-TABLE_PAIRS |= {"any_hit": wp.int32, "count": wp.int32}
-TABLE_POINTS = {"point_a": wp.vec3d, "point_b": wp.vec3d, "normal": wp.vec3d, "depth": wp.float64}
-TABLE_POINTS |= {"shown": wp.int32}
+PAIR_TYPES = {"pairs": wp.vec2i, "lods": wp.vec2i, "gap": wp.float64, "rotation": wp.mat33d, "translation": wp.vec3d}
+PAIR_TYPES |= {"any_hit": wp.int32, "count": wp.int32}
+POINT_TYPES = {"point_a": wp.vec3d, "point_b": wp.vec3d, "normal": wp.vec3d, "depth": wp.float64}
+POINT_TYPES |= {"shown": wp.int32}
 
 
 def check_remember(remember, gap) -> float | None:
@@ -66,7 +66,7 @@ class MemoryStage(Stage):
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return both tables, which keep what they hold where there is more room, and what has an entry a pair."""
         made = fields(self, rooms.pairs, row=wp.int32, place=wp.int32, asked=wp.float64)
-        for names, shape in ((TABLE_PAIRS, ()), (TABLE_POINTS, (self._points,))):
+        for names, shape in ((PAIR_TYPES, ()), (POINT_TYPES, (self._points,))):
             for name, dtype in names.items():
                 copy = partial(_copy_table, getattr(self.memory, name))
                 made.append(Array(self.memory, name, dtype, (2, rooms.pairs, *shape), copy))
