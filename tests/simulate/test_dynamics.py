@@ -195,12 +195,12 @@ def test_boxes_come_to_rest_on_a_plane(device):
         assert pose[2] == pytest.approx((0.5, 0.35, 0.25)[axis] - slop, abs=slop)
 
 
-@pytest.mark.parametrize("splits", [0, 2])
+@pytest.mark.parametrize("splits, remember", [(0, False), (2, False), (0, True), (2, True)])
 @pytest.mark.slow
-def test_a_stack_of_five_stands_for_ten_seconds(device, splits):
+def test_a_stack_of_five_stands_for_ten_seconds(device, splits, remember):
     cube = box(1, 1, 1, splits=splits)
     placed = [(cube, (0.02 * (k % 2), 0.01 * k, 0.5 + k, 0, 0, 0, 1)) for k in range(5)]
-    dynamics = on_ground(device, *placed)
+    dynamics = on_ground(device, *placed, remember=remember)
     start = dynamics.poses()[1:]
     run(dynamics, 600, 1 / 60)
     moved = dynamics.poses()[1:] - start
@@ -209,6 +209,7 @@ def test_a_stack_of_five_stands_for_ten_seconds(device, splits):
     sunk = np.diff(-moved[:, 2], prepend=0)  # of each cube into what is below
     assert sunk.min() > -0.05 * slop and sunk.max() < slop
     assert np.abs(dynamics.velocities()[0]).max() < 1e-3
+    assert not remember or (dynamics.query.memory.place.numpy()[:5] >= 0).all()
 
 
 def test_a_torus_falls_over_a_peg_and_stays(device):

@@ -50,7 +50,8 @@ class Dynamics(RigidBodies):
         capacity: `Buffers`, or the initial capacity for contacts; `step` grows it, `launch` does not.
         continuous: Whether surfaces that are apart are proved to stay apart: bodies stop, for the rest of a step, short
             of where they would meet, and rest a little apart. Kinematic objects stop too.
-        remember: As for `ManifoldQuery`: pairs that hardly move are not searched again.
+        remember: As for `ManifoldQuery`: pairs that hardly move are not searched again. Off, since a controller of LODs
+            that sees none of their cost makes them too fine, and pays once it changes them.
 
     Attributes:
         bodies, mass, rigid, kinematic: As `RigidBodies`.
@@ -72,7 +73,7 @@ class Dynamics(RigidBodies):
         angular_velocity=(0.0, 0.0, 0.0),
         capacity: Buffers | int | None = None,
         continuous: bool = False,
-        remember: bool | float = True,
+        remember: bool | float = False,
     ):
         super().__init__(scene, gravity, kinematic, velocity, angular_velocity)
         self.friction = float(finite_array(friction, "friction", ()))
