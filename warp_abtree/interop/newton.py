@@ -362,7 +362,8 @@ class NewtonContacts(DeviceMemory):
             matching.buffer.zero_()
             return
         query, room, buffer = self.query, len(self._count), contacts.rigid_contact_shape0.ptr
-        matching.row = query.memory.row
+        memory: Any = query.memory
+        matching.row = memory.row
         inputs = [buffer, self._first, query.pair_batch, query.manifolds, self._end, self._count, matching, index]
         inputs.append(contacts.rigid_contact_match_generation)
         wp.launch(kernels.match_contact_kernel, room, inputs, device=self.device)
