@@ -33,6 +33,8 @@ wp.set_module_options(native.options("base/lanes.cuh"))
 GAP_SHARE, SIZE_SHARE = wp.constant(wp.float64(2.0**-3)), wp.constant(wp.float64(2.0**-11))
 # Part of the smaller object's size that a point may have moved to be the same.
 MATCH_SHARE, MATCH_COSINE = wp.constant(wp.float64(2.0**-5)), wp.constant(wp.float64(0.5))
+# Part of the smaller object's size that points which touch may be apart.
+TOUCH_SHARE = wp.constant(wp.float64(2.0**-40))
 
 
 @wp.struct
@@ -328,7 +330,9 @@ def keep_points_kernel(
     if warp_lane() == 0:
         memory_inout.pairs[1 - memory_inout.turn[0], p] = batch.pairs[p]
     if place[p] >= 0:
-        recall_points(p, place[p], gap[p], trees, batch, memory_inout, manifolds_inout)
+        # What touches still does, where rounding has moved it apart.
+        touch = TOUCH_SHARE * smaller_size(trees, batch.pairs[p][0], batch.pairs[p][1])
+        recall_points(p, place[p], wp.max(gap[p], touch), trees, batch, memory_inout, manifolds_inout)
     else:
         note_points(p, row[p], gap[p], hits.any_hit[p], trees, batch, manifolds_inout, memory_inout)
 

@@ -265,6 +265,13 @@ def test_room_that_grows_keeps_what_is_known(device):
     np.testing.assert_allclose(result.points["point"][result.points["pair"] == 0], before["point"], atol=1e-13)
 
 
+def test_what_touches_without_a_gap_keeps_its_points(device):
+    scene = scene_with(device, (box(4, 4, 1, splits=3), FLOOR), (box(1, 1, 1), at(0.1, 0.2, 0.5)))
+    query = ab.ManifoldQuery(scene, [(0, 1)], gap=0.0, remember=REST)
+    first, again = query.run().points, query.run().points
+    assert is_resting(query)[0] and len(first["depth"]) == len(again["depth"]) > 0
+
+
 def test_solids_keep_whether_they_hold_one_another(device):
     """A ball inside a solid: no face crosses, and the pair that rests still says so, with the points that it had."""
     scene = ab.Scene(device)
