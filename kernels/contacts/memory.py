@@ -4,7 +4,8 @@ A pair rests while no point of its smaller object's box has moved farther, as th
 its gap has grown by no more than what is left of that, and neither object has changed its LOD. It is not traversed.
 Each of its points is one of either object, which were the same when the pair was searched: it lies in their middle now,
 and is as much less deep as they have come apart along its normal, which turns with the lower object. So what the pair
-lacks is a point that came nearer by that distance at most. The motion counts from the search, not from the last launch,
+lacks is a point that came nearer by that distance at most, where objects overlap but little: the way out of deep
+overlaps can turn within it. The motion counts from the search, not from the last launch,
 so that slow motions add up.
 
 A point of a pair that was searched again is one of those before if it is the nearest to it and the other way round, no
@@ -23,7 +24,7 @@ from warp_abtree.kernels.base.lanes import next_place, warp_lane, warp_size
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import PairBatch, pose_point, relative_pose
 from warp_abtree.kernels.contacts.manifold import Manifolds
-from warp_abtree.kernels.contacts.slots import tree_size
+from warp_abtree.kernels.contacts.slots import smaller_size, tree_size
 from warp_abtree.kernels.intersect.face_pairs import Hits, is_whole
 
 wp.set_module_options(native.options("base/lanes.cuh"))
@@ -43,6 +44,7 @@ class PointMemory:
 
     turn: wp.array(dtype=wp.int32)  # the table that is read, shape [1]
     known: wp.array(dtype=wp.int32)  # pairs in it, shape [1]
+    launches: wp.array(dtype=wp.int32)  # that have written a table, shape [1]
     pairs: wp.array2d(dtype=wp.vec2i)  # in the order of the launch, shape [2, pair]
     lods: wp.array2d(dtype=wp.vec2i)  # of both objects when they were searched, shape [2, pair]
     gap: wp.array2d(dtype=wp.float64)  # within which they were [world units], shape [2, pair]
@@ -88,12 +90,6 @@ def lods_of(trees: Trees, pair: wp.vec2i):
         trees.states.lod[trees.objects.state[pair[0]]],
         trees.states.lod[trees.objects.state[pair[1]]],
     )
-
-
-@wp.func
-def smaller_size(trees: Trees, a: wp.int32, b: wp.int32):
-    """Return half of the diagonal of the box of the smaller of two objects."""
-    return wp.min(tree_size(trees, trees.objects.state[a]), tree_size(trees, trees.objects.state[b]))
 
 
 @wp.func
@@ -341,4 +337,5 @@ def keep_points_kernel(
 def turn_memory_kernel(batch: PairBatch, hits: Hits, memory_inout: PointMemory):
     """Read the other table from now on, of which nothing is known where the launch lost something; one thread."""
     memory_inout.turn[0] = 1 - memory_inout.turn[0]
+    memory_inout.launches[0] += 1
     memory_inout.known[0] = wp.where(is_whole(batch, hits), batch.count[0], 0)

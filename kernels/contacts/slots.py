@@ -126,6 +126,12 @@ def tree_size(trees: Trees, state: wp.int32):
 
 
 @wp.func
+def smaller_size(trees: Trees, a: wp.int32, b: wp.int32):
+    """Return half of the diagonal of the box of the smaller of two objects."""
+    return wp.min(tree_size(trees, trees.objects.state[a]), tree_size(trees, trees.objects.state[b]))
+
+
+@wp.func
 def count_bits(trees: Trees, state: wp.int32):
     """Return how many bits a face of a tree state takes."""
     bits, faces = wp.int32(1), trees.models.face_count[trees.states.model[state]]
@@ -153,7 +159,7 @@ def start_slots_kernel(
         if gap.shape[0] > 0:
             shell = gap[p]
         a, b = trees.objects.state[batch.pairs[p][0]], trees.objects.state[batch.pairs[p][1]]
-        size = wp.min(tree_size(trees, a), tree_size(trees, b))
+        size = smaller_size(trees, batch.pairs[p][0], batch.pairs[p][1])
         weight = WEIGHT_LEAST
         if shell > WEIGHT_LEAST * size:
             weight = wp.where(shell < size, shell / size, wp.float64(1.0))

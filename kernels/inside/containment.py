@@ -56,8 +56,8 @@ def find_contained_kernel(
     """Find contained components of the pairs whose surfaces do not meet, a thread a pair.
 
     Args:
-        near_hit_inout: Whether each pair is near, shape [pair]; [0] where no distance was asked.
         batch: Pairs that the traversal passed over, as their `within` says, are passed over here too.
+        near_hit_inout: Whether each pair is near, shape [pair]; [0] where no distance was asked.
         contained_out: Face of the component that is inside, shape [pair].
     """
     p = wp.tid()

@@ -35,7 +35,7 @@ def pose_original_kernel(fine: Trees, batch: PairBatch, poses_out: wp.array(dtyp
 
 @wp.func
 def nearest_point(
-    fine: Trees, pose: PairPose, scaling: SearchScale, of_b: bool, state: wp.int32, x: wp.vec3d, hint: int
+    fine: Trees, pose: PairPose, scaling: SearchScale, of_b: bool, state: wp.int32, x: wp.vec3d, hint: wp.int32
 ):
     """Return the point of the surface of A or B that is nearest to a point, all in A's frame."""
     _, face = nearest_face(fine, pose, make_solid(fine, pose, scaling, of_b, state), x, hint, wp.float64(0.0))

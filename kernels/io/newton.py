@@ -173,13 +173,16 @@ def write_contact_kernel(
 
 @wp.struct
 class Matching:
-    """Which contacts are those of the launch before, where a buffer of Newton's asks for it."""
+    """What tells which contacts are those of the launch before, where a buffer of Newton's asks for it."""
 
     row: wp.array(dtype=wp.int32)  # place of each pair among those of the launch before, -1 for none, shape [pair]
-    start: wp.array(dtype=wp.int32)  # where the contacts of pairs of the launch before began, shape [pair]
-    next_start: wp.array(dtype=wp.int32)  # where those of this one begin, shape [pair]
-    buffer: wp.array(dtype=wp.int64)  # address of the contacts of the launch before, shape [1]
-    generation: wp.array(dtype=wp.int32)  # of the contacts, before they were cleared, shape [1]
+    start: wp.array(dtype=wp.int32)  # where the contacts of its pairs began, shape [pair]
+    next_start: wp.array(dtype=wp.int32)  # where those of this launch begin, shape [pair]
+    launches: wp.array(dtype=wp.int32)  # of the query, shape [1]
+    written: wp.array(dtype=wp.int32)  # that number when contacts were written last, shape [1]
+    generation: wp.array(dtype=wp.int32)  # of the buffer, before it was cleared, shape [1]
+    written_generation: wp.array(dtype=wp.int32)  # of what was written last, shape [1]
+    buffer: wp.array(dtype=wp.int64)  # address of what was written last, 0 for none, shape [1]
 
 
 @wp.kernel
@@ -196,13 +199,17 @@ def match_contact_kernel(
 ):
     """Write which contact of the buffer's last contents each point of one pair a thread is, -1 for a new one.
 
+    None is known where others have written or cleared the buffer since, or the query was launched in between.
+
     Args:
         buffer: Address of the contacts.
         first, end, count: As for `write_contact_kernel`.
         index_out, generation_out: The buffer's match indices, and the generation that they refer to, -1 for none.
     """
     p = wp.tid()
-    known, start = matching_inout.buffer[0] == buffer, first[0] + end[p] - count[p]
+    start, known = first[0] + end[p] - count[p], matching_inout.buffer[0] == buffer
+    known = known and matching_inout.generation[0] == matching_inout.written_generation[0]
+    known = known and matching_inout.launches[0] == matching_inout.written[0] + 1
     matching_inout.next_start[p] = start
     if p == 0:
         generation_out[0] = wp.where(known, matching_inout.generation[0], -1)
@@ -218,9 +225,11 @@ def match_contact_kernel(
 
 
 @wp.kernel
-def keep_start_kernel(buffer: wp.int64, matching_inout: Matching):
-    """Note where the contacts of each pair begin in a buffer, for the next launch."""
+def keep_start_kernel(buffer: wp.int64, generation: wp.array(dtype=wp.int32), matching_inout: Matching):
+    """Note where the contacts of each pair begin in a buffer, and its generation, for the next launch."""
     p = wp.tid()
     matching_inout.start[p] = matching_inout.next_start[p]
     if p == 0:
         matching_inout.buffer[0] = buffer
+        matching_inout.written_generation[0] = generation[0]
+        matching_inout.written[0] = matching_inout.launches[0]

@@ -327,7 +327,8 @@ def test_what_remember_takes(device):
             ab.ManifoldQuery(scene, gap=GAP, remember=wrong)
     with pytest.raises(ValueError, match="remember: needs a gap"):
         ab.ManifoldQuery(scene, remember=True)
-    for off in (None, False):
+    assert ab.ManifoldQuery(scene, gap=GAP, remember=np.True_).memory is not None
+    for off in (None, False, np.False_):
         query = ab.ManifoldQuery(scene, gap=GAP, remember=off)
         query.forget()
         assert query.memory is None

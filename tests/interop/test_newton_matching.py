@@ -117,3 +117,52 @@ def test_without_memory_nothing_matches(device, world):
     for _ in range(2):
         found.collide(state, contacts)
         assert (rows(contacts)[2] == -1).all()
+
+
+def test_contents_of_others_do_not_match(device, world):
+    """Another finder writes the buffer, it is cleared, or the query is launched between two calls."""
+    model, state, _ = world
+    found, other = ab.NewtonContacts(model), ab.NewtonContacts(model)
+    contacts = found.contacts()
+
+    def launch_apart():
+        poses = np.tile([0, 0, 0, 0, 0, 0, 1.0], (COUNT + 1, 1))
+        poses[:, 0] = 100 * np.arange(COUNT + 1)
+        found.scene.set_poses(poses)
+        found.query.run()
+
+    for between in (lambda: other.collide(state, contacts), contacts.clear, launch_apart):
+        found.collide(state, contacts)
+        between()
+        found.collide(state, contacts)
+        assert (rows(contacts)[2] == -1).all() and len(rows(contacts)[2]) == 4 * COUNT
+        assert contacts.rigid_contact_match_generation.numpy()[0] == -1
+        found.collide(state, contacts)
+        assert (rows(contacts)[2] >= 0).all()
+
+
+def test_other_buffers_in_the_same_place_do_not_match(device, world):
+    model, state, _ = world
+    found = ab.NewtonContacts(model)
+    for _ in range(12):
+        contacts = found.contacts()
+        found.collide(state, contacts)
+        assert (rows(contacts)[2] == -1).all()
+        del contacts
+
+
+def test_room_that_grows_keeps_matches(device, world):
+    """Two cubes rest while others arrive that there is no room for yet."""
+    model, state, move = world
+    lifted = np.zeros((COUNT, 3))
+    lifted[2:, 2] = np.arange(2, COUNT) * 5
+    move(lifted)
+    found = ab.NewtonContacts(model, capacity=ab.Buffers(pairs=2))
+    contacts = newton.Contacts(200, 0, device=device, contact_matching=True)
+    found.collide(state, contacts)
+    before, room = rows(contacts), len(found.query.pairs)
+    move(0 * lifted)
+    found.collide(state, contacts)
+    assert len(found.query.pairs) > room
+    now = rows(contacts)
+    np.testing.assert_array_equal(check_matches(now, before), now[0].max(1) <= 2)

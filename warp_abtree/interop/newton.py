@@ -134,7 +134,6 @@ class NewtonContacts(DeviceMemory):
             bolt want 32.
         solids: Mesh shapes that are solids, by index, or True for all: what lies inside one has points as deep as it
             is far from the surface, also once no face crosses. Of closed models, see `Scene.add`.
-
         remember: As for `ManifoldQuery`: pairs that hardly move are not searched again. `query.forget()` where the
             contacts are not to depend on the calls before, such as at the start of an episode.
         originals: As for `ManifoldQuery`: points on the shapes' own meshes, of a scene at coarser LODs.
@@ -190,6 +189,10 @@ class NewtonContacts(DeviceMemory):
             self.scene, None, capacity, gap=own, points=points, remember=remember, originals=originals
         )
         self._first = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self._matching, self._written = kernels.Matching(), None
+        self._matching.buffer = wp.zeros(1, dtype=wp.int64, device=self.device)
+        for name in ("written", "generation", "written_generation"):
+            setattr(self._matching, name, wp.zeros(1, dtype=wp.int32, device=self.device))
         self._grow()
 
     def _find_models(self, shapes, given):
@@ -248,10 +251,10 @@ class NewtonContacts(DeviceMemory):
     def _grow(self):
         room = len(self.query.pairs)
         self._count, self._end = (wp.zeros(room, dtype=wp.int32, device=self.device) for _ in range(2))
-        self._matching = matching = kernels.Matching()
+        matching, before = self._matching, self._matching.start
         matching.start, matching.next_start = (wp.zeros(room, dtype=wp.int32, device=self.device) for _ in range(2))
-        matching.generation = wp.zeros(1, dtype=wp.int32, device=self.device)
-        matching.buffer = wp.zeros(1, dtype=wp.int64, device=self.device)  # that of none
+        if before is not None:
+            wp.copy(matching.start, before, count=min(room, len(before)))
 
     def contacts(self, rigid_contact_max=None):
         """Return an empty `newton.Contacts`; by default with room for all points of each pair."""
@@ -361,10 +364,14 @@ class NewtonContacts(DeviceMemory):
         if index is None:
             matching.buffer.zero_()
             return
-        query, room, buffer = self.query, len(self._count), contacts.rigid_contact_shape0.ptr
+        query, room = self.query, len(self._count)
         memory: Any = query.memory
-        matching.row = memory.row
+        matching.row, matching.launches = memory.row, memory.memory.launches
+        # Held, so that no other buffer gets its address.
+        self._written = contacts.rigid_contact_shape0
+        buffer = self._written.ptr
         inputs = [buffer, self._first, query.pair_batch, query.manifolds, self._end, self._count, matching, index]
         inputs.append(contacts.rigid_contact_match_generation)
         wp.launch(kernels.match_contact_kernel, room, inputs, device=self.device)
-        wp.launch(kernels.keep_start_kernel, room, [buffer, matching], device=self.device)
+        inputs = [buffer, contacts.contact_generation, matching]
+        wp.launch(kernels.keep_start_kernel, room, inputs, device=self.device)

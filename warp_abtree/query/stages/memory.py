@@ -3,6 +3,7 @@
 from functools import partial
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import positive
@@ -22,11 +23,12 @@ def check_remember(remember, gap) -> float | None:
     Raises:
         ValueError: Neither a bool nor a distance above 0, or no gap.
     """
-    if remember is None or remember is False:
+    on = isinstance(remember, bool | np.bool_)
+    if remember is None or (on and not remember):
         return None
     if gap is None:
         raise ValueError("remember: needs a gap, of which it is a part")
-    return -1.0 if remember is True else positive(remember, "remember")
+    return -1.0 if on else positive(remember, "remember")
 
 
 def _copy_table(old, new):
@@ -59,7 +61,8 @@ class MemoryStage(Stage):
     def attach(self, operator: Operator):
         """Take the operator."""
         super().attach(operator)
-        self.memory.turn, self.memory.known = (wp.zeros(1, dtype=wp.int32, device=operator.device) for _ in range(2))
+        for name in ("turn", "known", "launches"):
+            setattr(self.memory, name, wp.zeros(1, dtype=wp.int32, device=operator.device))
         self._rest = memory.Rest()
         self._rest.distance, self._rest.sorted = self._distance, operator.given is None
 

@@ -215,7 +215,8 @@ class ManifoldQuery(Operator):
         points: Most points of a pair, 1 to 64. A pair has fewer where these hold against all twists.
         remember: How far [world units] the points of a pair's smaller object may move, as the other one sees it, until
             the pair is searched again: while it rests it keeps the points of its last search, moved with the objects,
-            so that a point is missing only if it came nearer, or into view, by that. True: an eighth of the gap, at
+            so that, where objects overlap but little, a point is missing only if it came nearer, or into view, by
+            that. True: an eighth of the gap, at
             most 2^-11 of the smaller object's size, half of its box's diagonal. It needs a gap. Results then depend on
             the launches before, in the same way on every device, until `forget`. None: every launch searches every
             pair.
