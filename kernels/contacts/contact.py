@@ -3,16 +3,18 @@
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import Trees, load_vertex
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees, load_vertex
 from warp_abtree.kernels.base.lanes import warp_lane, warp_size
-from warp_abtree.kernels.base.poses import PairBatch, pose_point
+from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.exact.expansion import EXPANSION_LANES
 from warp_abtree.kernels.intersect.uncertain_pairs import items_at_once
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_corners
 from warp_abtree.kernels.triangle.segment import face_normal, intersect_faces, unit_vector
 from warp_abtree.kernels.triangle.segment_filter import filter_normal, filter_segment
 
-wp.set_module_options(native.options("base/lanes.cuh", "exact/determinant.cuh", "exact/expansion.cuh"))
+wp.set_module_options(
+    native.options("base/lanes.cuh", "contacts/contacts.h", "exact/determinant.cuh", "exact/expansion.cuh")
+)
 
 # Differences of unit normals, and means of them, that are shorter have no direction worth the name.
 SHORTEST_NORMAL = wp.constant(wp.float64(2.0**-20))
@@ -180,3 +182,55 @@ def find_deferred_kernel(
         write_contact(trees, own, i, p0, p1, normal_a, normal_b, contacts_out)
         contacts_out.coplanar[i] = coplanar
         k += at_once * (step / warp_size())
+
+
+@native.func_native(cpu=True)
+def simd_contacts(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    rotation: wp.mat33d,
+    position: wp.vec3d,
+    proven: bool,
+    span: wp.vec3i,
+    faces: wp.array(dtype=wp.vec3i),
+    place: wp.array(dtype=wp.int32),
+    contacts: Contacts,
+) -> wp.int32:
+    """Compute the contacts of an object pair's face pairs, as `find_contact_kernel`; list those that are uncertain.
+
+    Args:
+        rotation, position: Pose of object A.
+        proven: Whether the face pairs are known to intersect.
+        span: First face pair, the one behind the last, and how many entries the list has.
+
+    Returns how many entries the list has then.
+    """
+
+
+@wp.kernel
+def find_pair_contacts_kernel(
+    trees: Trees,
+    batch: PairBatch,
+    proven: bool,
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    deferred_inout: Deferred,
+    contacts_out: Contacts,
+):
+    """Compute the contacts of one object pair, or defer them; one thread after the other, CPU only."""
+    p = wp.tid()
+    a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
+    if start[p] < start[p + 1]:
+        deferred_inout.total[0] = simd_contacts(
+            trees.models,
+            trees.states,
+            batch.poses[p],
+            trees.objects.rotation[a],
+            trees.objects.position[a],
+            proven,
+            wp.vec3i(start[p], start[p + 1], deferred_inout.total[0]),
+            faces,
+            deferred_inout.place,
+            contacts_out,
+        )

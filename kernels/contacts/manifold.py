@@ -210,7 +210,7 @@ def offer_crossing_kernel(
     pose = batch.poses[p]
     column = measure_crossing(crossing, trees, pose, contacts, curves)
     sense = wp.where(pose.swapped != 0, wp.float64(-1.0), wp.float64(1.0))
-    weight, directions = slots_inout.measures[p][1], slots_inout.directions
+    weight, directions = slots_inout.weight[p], slots_inout.directions
     bin, scores = find_bin(wp.vec3(sense * column.normal), directions), no_scores()
     centre = trees.models.centre[trees.states.model[trees.objects.state[crossing.a]]]
     if column.depth == NO_DEPTH:

@@ -24,14 +24,14 @@ wins.
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.lanes import next_place, warp_lane, warp_size, warp_sync
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 from warp_abtree.kernels.triangle.distance_bounds import load_points, three_points
 
-wp.set_module_options(native.options("base/lanes.cuh", "contacts/near_offer.cuh", "contacts/offer_list.h"))
+wp.set_module_options(native.options("base/lanes.cuh", "contacts/near_offer.cuh"))
 
 NORMAL_BINS, SCORES = native.constant("NORMAL_BINS"), native.constant("SCORES")
 SLOTS_A_BIN, SLOT_ROOM = native.constant("SLOTS_A_BIN"), native.constant("SLOT_ROOM")
@@ -47,7 +47,7 @@ class Slots:
 
     key: wp.array(dtype=wp.int64)  # unsigned, 0 where there is none, shape [SLOT_ROOM * pair]
     widths: wp.array(dtype=wp.vec2i)  # bits that a face of A takes, and one of B, shape [pair]
-    measures: wp.array(dtype=wp.vec2)  # gap at unit size, and weight of directions, shape [pair]
+    weight: wp.array(dtype=wp.float32)  # of directions, shape [pair]
     directions: wp.array(dtype=wp.float32)  # normal of each bin and two vectors across it, shape [9 * NORMAL_BINS]
 
 
@@ -103,21 +103,6 @@ def offer_scores(scores: nine_scores, bin: wp.int32, place: wp.int32, pair: wp.i
     """Offer a crossing contact with the scores of its points to the slots of its object pair."""
 
 
-@native.func_native(cpu=True)
-def simd_offer_list(
-    models: ModelPool,
-    states: StatePool,
-    pair_poses: wp.array(dtype=PairPose),
-    count: wp.int32,
-    list: wp.array(dtype=wp.vec3i),
-    measures: wp.array(dtype=wp.vec2),
-    directions: wp.array(dtype=wp.float32),
-    widths: wp.array(dtype=wp.vec2i),
-    slots: wp.array(dtype=wp.int64),
-):
-    """Offer so many listed face pairs to the slots of their object pairs, 16 at a time."""
-
-
 @wp.func
 def tree_size(trees: Trees, state: wp.int32):
     """Return half of the diagonal of the root box of a tree state."""
@@ -158,41 +143,42 @@ def start_slots_kernel(
         shell = wp.float64(0.0)
         if gap.shape[0] > 0:
             shell = gap[p]
-        a, b = trees.objects.state[batch.pairs[p][0]], trees.objects.state[batch.pairs[p][1]]
         size = smaller_size(trees, batch.pairs[p][0], batch.pairs[p][1])
         weight = WEIGHT_LEAST
         if shell > WEIGHT_LEAST * size:
             weight = wp.where(shell < size, shell / size, wp.float64(1.0))
-        swapped = batch.poses[p].swapped != 0
-        of_a, of_b = count_bits(trees, wp.where(swapped, b, a)), count_bits(trees, wp.where(swapped, a, b))
+        slots_out.weight[p] = wp.float32(weight)
+        lower, higher = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
+        of_a, of_b = count_bits(trees, trees.objects.state[lower]), count_bits(trees, trees.objects.state[higher])
         slots_out.widths[p] = wp.vec2i(of_a, of_b)
-        slots_out.measures[p] = wp.vec2(wp.float32(shell * batch.poses[p].scale), wp.float32(weight))
+
+
+@wp.func
+def offer_pair(
+    trees: Trees,
+    pose: PairPose,
+    pair: wp.int32,
+    face_a: wp.int32,
+    face_b: wp.int32,
+    gap: wp.array(dtype=wp.float64),
+    slots: Slots,
+):
+    """Offer a face pair that is apart to the slots of its object pair."""
+    scale = wp.float32(pose.scale)
+    a, b = load_points(trees, pose, pose.translation32 * scale, scale, face_a, face_b)
+    reach, weight, widths = wp.float32(gap[pair] * pose.scale), slots.weight[pair], slots.widths[pair]
+    offer_faces(a, b, reach, weight, slots.directions, widths, face_a, face_b, pair, slots.key)
 
 
 @wp.kernel
 def offer_near_kernel(step: wp.int32, trees: Trees, batch: PairBatch, hits: Hits, slots_inout: Slots):
-    """Offer the face pairs that are listed as apart to the slots of their object pairs, in a grid-stride loop."""
+    """Offer the face pairs that later passes found apart to the slots of their object pairs, in a grid-stride loop."""
     i = wp.tid()
     end = wp.int32(wp.min(wp.uint32(hits.apart_total[0]), wp.uint32(hits.apart.shape[0])))
     while i < end:
         row = hits.apart[i]
-        pose = batch.poses[row[0]]
-        scale = wp.float32(pose.scale)
-        a, b = load_points(trees, pose, pose.translation32 * scale, scale, row[1], row[2])
-        measures, widths = slots_inout.measures[row[0]], slots_inout.widths[row[0]]
-        directions = slots_inout.directions
-        offer_faces(a, b, measures[0], measures[1], directions, widths, row[1], row[2], row[0], slots_inout.key)
+        offer_pair(trees, batch.poses[row[0]], row[0], row[1], row[2], hits.gap, slots_inout)
         i += step
-
-
-@wp.kernel
-def offer_list_kernel(trees: Trees, batch: PairBatch, hits: Hits, slots_inout: Slots):
-    """Do what `offer_near_kernel` does, 16 face pairs at a time, by one thread; CPU only."""
-    count = wp.int32(wp.min(wp.uint32(hits.apart_total[0]), wp.uint32(hits.apart.shape[0])))
-    measures, directions, widths = slots_inout.measures, slots_inout.directions, slots_inout.widths
-    simd_offer_list(
-        trees.models, trees.states, batch.poses, count, hits.apart, measures, directions, widths, slots_inout.key
-    )
 
 
 @wp.func

@@ -3,7 +3,7 @@
 A chunk is CHUNK contacts of one pair, the pair's last one shorter. One warp a chunk sums its contacts in their order;
 what it needs of the whole pair it sums itself, of the pair's chunks in theirs, so that no bit depends on the device or
 on the order in which threads run. With a gap contacts of faces that are apart count nothing. The CPU sums a pair after
-the other (`simd`).
+the other (`sum_pair_kernel`).
 """
 
 import warp as wp
@@ -22,7 +22,7 @@ from warp_abtree.kernels.contacts.contact import (
 from warp_abtree.kernels.contacts.travel import choose_travel, loop_change, reach_contacts
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
-wp.set_module_options(native.options("base/lanes.cuh"))
+wp.set_module_options(native.options("base/lanes.cuh", "contacts/contact_sums.h"))
 
 # Contacts of one object pair that are summed together, in places that its first contact tells.
 CHUNK = native.constant("CHUNK")
@@ -295,3 +295,65 @@ def measure_travel_kernel(
     if warp_lane() == 0:
         pair_contacts_inout.point[p] = origin + sums.middle[p]
         pair_contacts_inout.travel[p] = choose_travel(trees, batch.pairs[p], n, origin, area, change, front - back)
+
+
+@native.func_native(cpu=True)
+def simd_sum_lengths(contacts: Contacts, ends: wp.vec2i, total: wp.ref[wp.float64], number: wp.ref[wp.float64]):
+    """Find the length of an object pair's contacts, and how many are of faces that intersect, as `sum_lengths`."""
+
+
+@native.func_native(cpu=True)
+def simd_sum_means(
+    contacts: Contacts,
+    ends: wp.vec2i,
+    total: wp.float64,
+    number: wp.float64,
+    middle: wp.ref[wp.vec3d],
+    normal: wp.ref[wp.vec3d],
+):
+    """Find the mean point of a pair's contacts, from the first end, and the mean of normals, as `sum_means`."""
+
+
+@native.func_native(cpu=True)
+def simd_sum_areas(
+    contacts: Contacts,
+    ends: wp.vec2i,
+    middle: wp.vec3d,
+    normal: wp.vec3d,
+    area: wp.ref[wp.float64],
+    change: wp.ref[wp.float64],
+):
+    """Find the area within a pair's contact curve and its change, as `sum_chunks`."""
+
+
+@wp.kernel
+def sum_pair_kernel(
+    trees: Trees,
+    batch: PairBatch,
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    contacts: Contacts,
+    pair_contacts_out: PairContacts,
+):
+    """Sum the contacts of one object pair a thread, as the kernels above do; CPU only."""
+    p = wp.tid()
+    ends = wp.vec2i(start[p], start[p + 1])
+    total, number = wp.float64(0.0), wp.float64(0.0)
+    simd_sum_lengths(contacts, ends, total, number)
+    if number == wp.float64(0.0):
+        write_no_contacts(p, pair_contacts_out)
+        return
+    middle, normal = wp.vec3d(), wp.vec3d()
+    simd_sum_means(contacts, ends, total, number, middle, normal)
+    n = mean_normal(trees, batch.pairs[p], normal)
+    area, change = wp.float64(0.0), wp.float64(0.0)
+    simd_sum_areas(contacts, ends, middle, n, area, change)
+    origin = contacts.p0[ends[0]]
+    front, back = wp.float64(0.0), wp.float64(0.0)
+    if area == wp.float64(0.0):
+        own = contact_objects(batch, p)
+        span = wp.vec3i(p, ends[0], ends[1])
+        front, back = reach_contacts(trees, own, batch.poses[p], span, faces, contacts, n, origin)
+    pair_contacts_out.normal[p] = n
+    pair_contacts_out.point[p] = origin + middle
+    pair_contacts_out.travel[p] = choose_travel(trees, batch.pairs[p], n, origin, area, change, front - back)

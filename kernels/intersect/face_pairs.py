@@ -29,8 +29,6 @@ OUTPUT_FACES = wp.constant(2)
 WITHIN = wp.constant(-1)
 # EXACT, and face pairs that are apart by less than a gap are listed too.
 GAP = wp.constant(-2)
-# GAP, but all face pairs that are apart and may be nearer than a gap are listed as such, whether they are or not.
-NEAR_LISTED = wp.constant(-3)
 
 # On the pair of a face pair in `Hits.face`: it is apart.
 NEAR_BIT = wp.constant(1 << 30)
@@ -45,16 +43,6 @@ class PairTests:
 
     nodes: wp.int32  # pairs of boxes compared
     faces: wp.int32  # pairs of faces measured
-
-
-@wp.struct
-class TraversalTests:
-    """Tests of an object pair by a warp or a lane of it."""
-
-    nodes: wp.int32  # pairs of boxes compared
-    faces: wp.int32  # pairs of faces tested
-    uncertain: wp.int32  # those that are uncertain in float32
-    hits: wp.int32  # those that meet
 
 
 @wp.struct

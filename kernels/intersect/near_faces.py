@@ -13,7 +13,7 @@ from warp_abtree.kernels.base.counters import count_flags, reserve_slot, take_sl
 from warp_abtree.kernels.base.lanes import warp_lane, warp_size, warp_sync
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.exact.predicates import EXACT
-from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits, list_apart, report_hit, test_faces
+from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits, report_hit, test_faces
 from warp_abtree.kernels.search.item import item_first, item_second
 from warp_abtree.kernels.search.warp_stack import push_signed_pair, read_signed_pair, signed_pairs
 from warp_abtree.kernels.triangle.corners import load_triangles
@@ -76,14 +76,6 @@ def report_near(
     for i in range(near):
         report_hit(slot + i, pair | NEAR_BIT, pose.swapped, item_first(apart[i]), item_second(apart[i]), hits)
     return near
-
-
-@wp.func
-def list_all_apart(pair: wp.int32, count: wp.int32, apart: wp.array(dtype=wp.int64), hits: Hits):
-    """List so many face pairs as apart. For threads of the CPU."""
-    slot = take_slots(hits.apart_total, count)
-    for i in range(count):
-        list_apart(slot + i, pair, item_first(apart[i]), item_second(apart[i]), hits)
 
 
 @wp.func

@@ -44,15 +44,6 @@ def clear_hits(p: wp.int32, hits: Hits):
     hits.exact_tests[p] = wp.int64(0)
 
 
-@wp.struct
-class ThreadSteps:
-    """What a launch of threads does: one thread starts all pairs, alone or before others are there."""
-
-    within: wp.array(dtype=wp.float64)  # as for `relative_pose_kernel`
-    starts: wp.bool  # whether pairs are started
-    traverses: wp.bool  # whether they are traversed
-
-
 @functools.cache
 def pose_starter(with_distances: bool):
     """Return the function that starts the traversal of a pair: for pairs that meet, or are nearer than distances."""

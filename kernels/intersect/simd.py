@@ -1,8 +1,4 @@
-"""The traversal of the CPU: threads that take one object pair after the other, depth first, in vector instructions.
-
-Number by number what warps compute on CUDA. Items do not wait for one another, so the processor works on several at
-once.
-"""
+"""Face pairs that intersect, are nearer than a gap, or are not proved apart: policies of the search by threads."""
 
 import functools
 
@@ -13,19 +9,8 @@ from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
 from warp_abtree.kernels.base.counters import take_slots
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.exact.predicates import EXACT
-from warp_abtree.kernels.intersect.descent import (
-    CPU_STACK_LENGTH,
-    NEVER,
-    WAITING_LENGTH,
-    Descent,
-    advance,
-    count_repeats,
-    shuffle_stack,
-    start_descent,
-)
 from warp_abtree.kernels.intersect.face_pairs import (
     GAP,
-    NEAR_LISTED,
     OUTPUT_ANY,
     OUTPUT_FACES,
     WITHIN,
@@ -36,24 +21,14 @@ from warp_abtree.kernels.intersect.face_pairs import (
     scaled_gap,
     test_faces,
 )
-from warp_abtree.kernels.intersect.near_faces import list_all_apart, part_uncertain, report_near
-from warp_abtree.kernels.intersect.relative_pose import ThreadSteps, pairs_starter
-from warp_abtree.kernels.search.item import first_item, item_first, item_second
-from warp_abtree.kernels.search.load_balance import Work, take_thread, take_unit
+from warp_abtree.kernels.intersect.near_faces import part_uncertain, report_near
+from warp_abtree.kernels.intersect.relative_pose import pairs_starter
+from warp_abtree.kernels.search.item import item_first, item_second
+from warp_abtree.kernels.search.thread_search import THREAD_HEADERS, FaceTests, ThreadPolicy, thread_search
 
-MODULE_OPTIONS = native.options(
-    "base/counters.cuh",
-    "base/lanes.cuh",
-    "exact/determinant.cuh",
-    "intersect/descend.h",
-    "intersect/float32_filter.h",
-    "intersect/float64_filter.h",
-    "intersect/near_filter.h",
-    "intersect/open_subtrees.h",
-    "intersect/subtrees.h",
-    "search/load_balance.cuh",
-)
-wp.set_module_options(MODULE_OPTIONS)
+FILTERS = ("exact/determinant.cuh", "intersect/float32_filter.h")  # headers of all policies
+HIT_FILTERS = (*FILTERS, "intersect/float64_filter.h", "intersect/near_filter.h")
+wp.set_module_options(native.options(*THREAD_HEADERS, *HIT_FILTERS))
 
 
 @wp.struct
@@ -64,15 +39,6 @@ class Filtered:
     uncertain: wp.int32  # those that another filter or exact signs decide
     apart: wp.int32  # those that are apart, perhaps nearer than a gap
     tested: wp.int32  # those that were looked at
-
-
-@wp.struct
-class FaceTests:
-    """Counts of the face pair tests of an object pair."""
-
-    total: wp.int64  # all of them
-    float64: wp.int64  # those that were uncertain in float32
-    exact: wp.int64  # those that took exact signs
 
 
 @native.func_native(cpu=True)
@@ -183,8 +149,8 @@ def resolve_uncertain(
 
 
 @wp.func
-def write_counts(p: wp.int32, hit_count: wp.int64, node_tests: wp.int64, tests: FaceTests, hits: Hits):
-    hits.count[p] = hit_count
+def write_counts(p: wp.int32, node_tests: wp.int64, tests: FaceTests, hits: Hits):
+    hits.count[p] = tests.hits + tests.near
     hits.node_tests[p] = node_tests
     hits.triangle_tests[p] = tests.total
     hits.float64_tests[p] = tests.float64
@@ -236,61 +202,53 @@ def test_gap_pairs(
     tests.exact += wp.int64(found.uncertain)
 
 
-@functools.cache
-def thread_traversal(mode: int):
-    """Return the kernel whose threads share the object pairs, at a precision, WITHIN, GAP or NEAR_LISTED."""
-    with_gap = mode in (int(GAP), int(NEAR_LISTED))
-    start_pairs = pairs_starter(with_gap or mode == int(WITHIN))
+@wp.func
+def report_met(
+    output: wp.int32,
+    pair: wp.int32,
+    swapped: wp.int32,
+    count: wp.int32,
+    faces: wp.array(dtype=wp.int64),
+    hits: Hits,
+    tests: wp.ref[FaceTests],
+):
+    """Count and report the face pairs that met, which stand in front of a list; return how many."""
+    if count > 0:
+        tests.hits += wp.int64(count)
+        report_hits(output, pair, swapped, count, faces, hits)
+    return count
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
-    def traverse_thread_kernel(
+
+@functools.cache
+def thread_policy(mode: int) -> ThreadPolicy:
+    """Return the policy at a precision, for WITHIN or for GAP."""
+    with_gap, within = mode == int(GAP), mode == int(WITHIN)
+
+    @wp.func
+    def test(
         output: wp.int32,
         trees: Trees,
-        plain_tests: wp.int32,
-        steps: ThreadSteps,
-        batch_inout: PairBatch,
-        memory_inout: wp.array2d(dtype=wp.float32),
-        hits_inout: Hits,
-        work_inout: Work,
+        batch: PairBatch,
+        pair: wp.int32,
+        waiting: wp.int32,
+        faces: wp.array(dtype=wp.int64),
+        uncertain: wp.array(dtype=wp.int64),
+        apart: wp.array(dtype=wp.int64),
+        hits: Hits,
+        tests: wp.ref[FaceTests],
     ):
-        """Start all object pairs, by one thread; take one after the other and traverse it depth first. CPU only."""
-        if steps.starts:
-            start_pairs(output, trees, batch_inout, steps.within, hits_inout, work_inout)
-        if not steps.traverses:
-            return
-        count = wp.min(batch_inout.count[0], batch_inout.pairs.shape[0])
-        stack = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
-        below = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
-        faces = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
-        uncertain = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
-        apart = wp.zeros(shape=wp.static(WAITING_LENGTH if with_gap else 1), dtype=wp.int64)
-        descent = Descent()
-        descent.thread = take_thread(work_inout.counter)
-        p = take_unit(work_inout.counter)
-        while p < count:
-            pose = batch_inout.poses[p]
-            stack[0] = first_item(trees.states, pose)
-            slabs = descent.thread < memory_inout.shape[0] and wp.static(mode != int(WITHIN)) and pose.error < wp.inf
-            plain = wp.where(slabs, wp.int64(plain_tests), NEVER)
-            start_descent(output, plain, count_repeats(p, batch_inout.poses), descent)
-            hit_count, near_count, tests = wp.int64(0), wp.int64(0), FaceTests()
-            while descent.top > 0 or descent.deep > 0:
-                waiting = advance(trees, pose, hit_count, descent, stack, below, memory_inout, faces)
-                found = Filtered()
-                if wp.static(with_gap):
-                    test_gap_pairs(trees, pose, waiting, faces, uncertain, apart, found, tests)
-                    if wp.static(mode == int(GAP)):
-                        near_count += wp.int64(report_near(trees, pose, p, found.apart, apart, hits_inout))
-                    else:
-                        list_all_apart(p, found.apart, apart, hits_inout)
-                else:
-                    test_leaf_pairs(wp.static(mode), output, trees, pose, waiting, faces, uncertain, found, tests)
-                if found.met > 0:
-                    hit_count += wp.int64(found.met)
-                    report_hits(output, p, pose.swapped, found.met, faces, hits_inout)
-                if output == OUTPUT_ANY:
-                    shuffle_stack(found.met, descent, stack)
-            write_counts(p, hit_count + near_count, descent.tests, tests, hits_inout)
-            p = take_unit(work_inout.counter)
+        pose, found = batch.poses[pair], Filtered()
+        if wp.static(with_gap):
+            test_gap_pairs(trees, pose, waiting, faces, uncertain, apart, found, tests)
+            tests.near += wp.int64(report_near(trees, pose, pair, found.apart, apart, hits))
+        else:
+            test_leaf_pairs(wp.static(mode), output, trees, pose, waiting, faces, uncertain, found, tests)
+        return report_met(output, pair, pose.swapped, found.met, faces, hits, tests)
 
-    return traverse_thread_kernel
+    start = pairs_starter(with_gap or within)
+    return ThreadPolicy(HIT_FILTERS, not within, with_gap, Hits, start, test, write_counts)
+
+
+def thread_traversal(mode: int):
+    """Return the kernel whose threads share the object pairs, at a precision, for WITHIN or for GAP."""
+    return thread_search(thread_policy(mode), int(OUTPUT_ANY))

@@ -23,7 +23,8 @@ from warp_abtree.kernels.base.lanes import (
 from warp_abtree.kernels.base.nodes import load_constant_node
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.exact.predicates import UNCERTAIN
-from warp_abtree.kernels.intersect.face_pairs import OUTPUT_FACES, Hits, TraversalTests, defer_uncertain, report_hit
+from warp_abtree.kernels.intersect.face_pairs import OUTPUT_FACES, Hits, defer_uncertain, report_hit
+from warp_abtree.kernels.search.warp_search import TraversalTests
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_near
 from warp_abtree.kernels.triangle.float32_filter import (
     FLOAT32_UNIT,

@@ -13,7 +13,7 @@ from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.lanes import next_place, warp_any, warp_lane, warp_size, warp_sync
 from warp_abtree.kernels.base.nodes import Node, load_constant_node
 from warp_abtree.kernels.base.poses import PairPose
-from warp_abtree.kernels.intersect.face_pairs import Hits, TraversalTests
+from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.intersect.small_tree_tiles import (
     SMALL_A,
     SMALL_B,
@@ -24,6 +24,7 @@ from warp_abtree.kernels.intersect.small_tree_tiles import (
     write_number,
 )
 from warp_abtree.kernels.search.item import INDEX_MASK
+from warp_abtree.kernels.search.warp_search import TraversalTests
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

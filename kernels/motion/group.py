@@ -261,7 +261,7 @@ def search_group(
 
 
 @cache
-def warp_search(kind):
+def warp_motion_search(kind):
     """Return the kernel of warps for motions of a kind: `path.Motion` or `linear.LinearMotion`."""
 
     # Fourteen warps a multiprocessor hide more of what loads wait for than spilled registers cost.

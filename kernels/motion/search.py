@@ -100,7 +100,7 @@ def search_contact(
 
 
 @cache
-def thread_search(kind):
+def thread_motion_search(kind):
     """Return the kernel of the CPU's threads for motions of a kind."""
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)

@@ -68,8 +68,8 @@ def test_no_near_contact_beats_the_winner_of_its_slot(device, name, warps):
         rows = rows[facing & (along > 0.995) & ahead]
         slots = slots_of(query)
         key, directions = slots.key.numpy()[:ROOM], slots.directions.numpy().reshape(BINS, 3, 3).astype(float)
-        (gap, weight), widths = slots.measures.numpy()[0], slots.widths.numpy()[0]
-        scale = gap / GAP
+        weight, widths = slots.weight.numpy()[0], slots.widths.numpy()[0]
+        scale = query.pair_poses.numpy()[0]["scale"]
         points = scale * ((rows["p0"] + rows["p1"]) / 2 - models[0].centre)
         normal = rows["normal_a"] - rows["normal_b"]
         cosine = normal @ directions[:, 0].T
@@ -102,8 +102,8 @@ def test_winners_are_near_and_have_their_scores(device, warps):
     rows = scene.intersect([(0, 1)], output="contacts", gap=GAP).contacts
     near = {tuple(pair): separation for pair, separation in zip(rows["faces"].tolist(), rows["separation"])}
     slots = slots_of(query)
-    (gap, weight), (of_a, of_b) = slots.measures.numpy()[0], slots.widths.numpy()[0]
-    scale, seen = gap / GAP, 0
+    weight, (of_a, of_b) = slots.weight.numpy()[0], slots.widths.numpy()[0]
+    scale, seen = query.pair_poses.numpy()[0]["scale"], 0
     corners = (
         scale * (vertices[faces] - ball.centre),
         scale * (vertices[faces] @ quaternion_matrix(pose[3:]).T + pose[:3] - ball.centre),
@@ -115,6 +115,6 @@ def test_winners_are_near_and_have_their_scores(device, warps):
         pair = name >> int(of_b), name & ((1 << int(of_b)) - 1)
         assert pair in near
         reach = max(np.linalg.norm(own[face], axis=1).max() for own, face in zip(corners, pair))
-        assert score <= -scale * near[pair] + weight * (reach + gap) + 1e-5
+        assert score <= -scale * near[pair] + weight * (reach + scale * GAP) + 1e-5
         seen += 1
     assert seen > 20

@@ -147,13 +147,17 @@ def reached(adjoint, found):
 
 
 MAKERS = {
+    "contacts.near_search": [lambda made: made.warp_near_search(), lambda made: made.thread_near_search()],
     "contacts.points": [lambda made: made.point_chooser(4)],
     "intersect.dual_tree": [lambda made: made.warp_traversal(int(EXACT), False)],
     "intersect.relative_pose": [lambda made: made.relative_poses(False)],
     "intersect.simd": [lambda made: made.thread_traversal(int(EXACT))],
     "io.contact_results": [lambda made: made.contact_packer(wp.float64, True)],
-    "motion.group": [lambda made: made.warp_search(Motion), lambda made: made.warp_search(LinearMotion)],
-    "motion.search": [lambda made: made.thread_search(Motion), lambda made: made.thread_search(LinearMotion)],
+    "motion.group": [lambda made: made.warp_motion_search(Motion), lambda made: made.warp_motion_search(LinearMotion)],
+    "motion.search": [
+        lambda made: made.thread_motion_search(Motion),
+        lambda made: made.thread_motion_search(LinearMotion),
+    ],
     "update.block_update": [lambda made: made.state_update(True)],
 }
 

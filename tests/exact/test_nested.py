@@ -12,8 +12,8 @@ from warp_abtree import testing
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool
 from warp_abtree.kernels.base.poses import PairPose
-from warp_abtree.kernels.intersect import descent
-from warp_abtree.kernels.intersect.descent import (
+from warp_abtree.kernels.search import descent
+from warp_abtree.kernels.search.descent import (
     CPU_STACK_LENGTH,
     WAITING_LENGTH,
     Descent,
@@ -23,7 +23,7 @@ from warp_abtree.kernels.intersect.descent import (
 )
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
 
-wp.set_module_options(native.options("intersect/open_subtrees.h", "intersect/subtrees.h"))
+wp.set_module_options(native.options("search/open_subtrees.h", "search/subtrees.h"))
 
 CPU = "cpu"
 AT_ONCE = 100  # leaf pairs that a test waits for

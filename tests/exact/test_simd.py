@@ -13,10 +13,11 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.exact.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
-from warp_abtree.kernels.intersect import descent, face_pairs
-from warp_abtree.kernels.intersect.descent import CPU_STACK_LENGTH, ITEMS_AT_ONCE, WAITING_LENGTH
+from warp_abtree.kernels.intersect import face_pairs
 from warp_abtree.kernels.intersect.face_pairs import face_plane_signs, intersect_straddling_faces
 from warp_abtree.kernels.intersect.simd import Filtered, simd_float32_filter, simd_float64_filter
+from warp_abtree.kernels.search import descent
+from warp_abtree.kernels.search.descent import CPU_STACK_LENGTH, ITEMS_AT_ONCE, WAITING_LENGTH
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, SEPARATED
 
@@ -26,7 +27,7 @@ wp.set_module_options(
     native.options(
         "base/lanes.cuh",
         "exact/determinant.cuh",
-        "intersect/descend.h",
+        "search/descend.h",
         "intersect/float32_filter.h",
         "intersect/float64_filter.h",
     )

@@ -15,7 +15,7 @@ from helpers.scenes import add_objects
 
 import warp_abtree as ab
 from warp_abtree.checks.cpu_threads import core_count
-from warp_abtree.kernels.intersect import descent
+from warp_abtree.kernels.search import descent
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.scene import sweep as pose_sweep
 

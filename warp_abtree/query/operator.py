@@ -66,7 +66,6 @@ class Operator(DeviceMemory):
     broad_phase: Any = None
     near: Any = None
     hits: Any
-    lists_apart = False  # whether face pairs that are apart and may be near are listed, on every device
     counts: wp.array
     traversal: Any
     lists_hits = False
@@ -92,7 +91,7 @@ class Operator(DeviceMemory):
         self._attach_stages()
         places = self._find_places(room.pairs, sort_pairs)
         self.readout = Readout(self)
-        uncertain = (room.uncertain or UNCERTAIN_ROOM) if self.uses_warps() or self.lists_apart else 0
+        uncertain = (room.uncertain or UNCERTAIN_ROOM) if self.uses_warps() else 0
         hits = (room.hits or max(1024, 16 * places)) if output == "faces" else 0
         self.rooms = Rooms()
         self.make_room(places, hits, uncertain)

@@ -10,7 +10,6 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.io import results as kernels
-from warp_abtree.query.request import APART_FOR_UNCERTAIN
 from warp_abtree.query.result import COUNTERS, Found, Result, Totals
 from warp_abtree.query.sorting import HitSort, first_sort, sort_rows
 from warp_abtree.query.staging import Staging, first_rows, view_memory
@@ -26,12 +25,6 @@ def readout_kernels(device, output: str) -> list:
     if not current_regime().packs(device):
         return []
     return [(kernels.pack_pair_kernel, kernels.BLOCK_DIM), *(first_sort(device) if output == "faces" else [])]
-
-
-def waiting_demand(operator: Any, apart: int, uncertain: int) -> int:
-    """Return the room that an operator's lists need for face pairs that are apart, and that are uncertain."""
-    listed = uncertain if operator.uses_warps() else 0
-    return max(apart, listed * (APART_FOR_UNCERTAIN if operator.lists_apart else 1))
 
 
 class HostViews:
@@ -123,11 +116,9 @@ class Readout:
             return self._totals(self.staging.fetch_words(self._pack_pairs(0), HEADER))
         views, hits, total, uncertain = self.views, operator.hits, 0, 0
         if operator.output == "faces":
-            total = int(views.counts[0].sum())
+            total = max(int(views.counts[0].sum()), self._read_count(hits.witness_total))
         if operator.rooms.uncertain:
-            apart, witnesses = (self._read_count(count) for count in (hits.apart_total, hits.witness_total))
-            waiting = int(views.counts[FLOAT64_ROW].sum())
-            total, uncertain = max(total, witnesses), waiting_demand(operator, apart, waiting)
+            uncertain = max(int(views.counts[FLOAT64_ROW].sum()), self._read_count(hits.apart_total))
         return Totals(operator.guard.outcome(), self._pair_count(int(views.pair_count[0])), total, uncertain)
 
     @staticmethod
@@ -145,7 +136,7 @@ class Readout:
         launched, found, total, uncertain, apart, witnesses = words[:HEADER].tolist()
         total = max(total, witnesses)
         listed, waits = self.operator.output == "faces", self.operator.rooms.uncertain
-        demand = waiting_demand(self.operator, apart, uncertain) if waits else 0
+        demand = max(apart, uncertain) if waits else 0
         return Totals(launched, self._pair_count(found), total if listed else 0, demand)
 
     def read_pairs(self, device: bool) -> Found:

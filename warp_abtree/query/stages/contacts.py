@@ -68,7 +68,7 @@ import warp as wp
 
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.base.lanes import WARP_SIZE
-from warp_abtree.kernels.contacts import contact, separation, simd, summary
+from warp_abtree.kernels.contacts import contact, separation, summary
 from warp_abtree.kernels.io import contact_results as pack
 from warp_abtree.kernels.io import sort_hits
 from warp_abtree.query.operator import Operator
@@ -124,7 +124,7 @@ class ContactStage(Stage):
     def kernels(self, device) -> list:
         """Return what finds contacts, and what sorts."""
         if not current_regime().uses_warps(device):
-            finding = simd.find_pair_contacts_kernel, contact.find_deferred_kernel
+            finding = contact.find_pair_contacts_kernel, contact.find_deferred_kernel
             return [*((kernel, WARP_SIZE) for kernel in finding), (sort_hits.sort_by_pair_kernel, 256)]
         finding = contact.find_contact_kernel, summary.sum_loop_kernel
         return [*((kernel, WARP_SIZE) for kernel in finding), *first_sort(device)]
@@ -202,7 +202,7 @@ class ContactStage(Stage):
         if warps:
             launch(contact.find_contact_kernel, count, inputs, WARP_SIZE)
         else:
-            launch(simd.find_pair_contacts_kernel, operator.rooms.pairs, inputs)
+            launch(contact.find_pair_contacts_kernel, operator.rooms.pairs, inputs)
         processors = operator.device.sm_count * WARP_SIZE if operator.device.is_cuda else 0
         if self._with_gap:
             if warps:
@@ -219,7 +219,7 @@ class ContactStage(Stage):
         count, sums = self._chunk_count(count, room), self._sums
         given = [operator.batch.trees, operator.pair_batch, self.start, self.faces, self.contacts]
         if not operator.uses_warps():
-            operator.launch_kernel(simd.sum_pair_kernel, room, [*given, means])
+            operator.launch_kernel(summary.sum_pair_kernel, room, [*given, means])
             return
         operator.launch_warps(summary.sum_length_kernel, count, [self.start, self.contacts, sums])
         operator.launch_warps(summary.sum_mean_kernel, count, [self.start, self.contacts, sums])
@@ -307,7 +307,8 @@ def plan_contacts(precision, within, gap, sums: bool, dtype: Any = np.float64, m
         ValueError: An unknown precision.
     """
     check_request("faces", precision)
-    intersect = IntersectStage("faces", precision, gap is not None, reads=False, reduced=not sums, resting=memory)
+    slots = None if sums else SlotStage(gap is not None)
+    intersect = IntersectStage("faces", precision, gap is not None, reads=False, slots=slots, resting=memory)
     apart: list[Stage] = [] if within is None else [ApartStage(within)]
     if gap is not None:
         gaps = gap if isinstance(gap, GapStage) else GapStage(gap)
@@ -315,8 +316,8 @@ def plan_contacts(precision, within, gap, sums: bool, dtype: Any = np.float64, m
         apart.append(gaps)
     if memory is not None:
         apart.append(memory)
-    slots: list[Stage] = [] if sums else [SlotStage(gap is not None)]
-    return [*apart, intersect, *slots, InsideStage(), ContactStage(precision, gap is not None and sums, sums, dtype)]
+    reduced: list[Stage] = [] if slots is None else [slots]
+    return [*apart, intersect, *reduced, InsideStage(), ContactStage(precision, gap is not None and sums, sums, dtype)]
 
 
 def warn_of_winding(scene):

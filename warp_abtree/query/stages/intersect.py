@@ -6,7 +6,7 @@ import warp as wp
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.intersect import face_pairs, near_faces
 from warp_abtree.query.operator import Operator
-from warp_abtree.query.request import APART_FOR_UNCERTAIN, OUTPUTS, PRECISIONS, check_gap, check_request
+from warp_abtree.query.request import OUTPUTS, PRECISIONS, check_gap, check_request
 from warp_abtree.query.result import COUNTERS, Found
 from warp_abtree.query.stage import Array, PairDistance, Rooms, Stage
 from warp_abtree.query.stages.inside import InsideStage
@@ -50,7 +50,7 @@ class IntersectStage(HitStage):
         output: "any", "count" or "faces".
         precision: As for `Query`.
         with_gap: Whether the hits have gaps.
-        reduced: Whether what is apart is only listed, for another stage to reduce.
+        slots: `SlotStage` that reduces what is apart, or None where it is reported.
         reads: Whether results have the hits as rows.
         resting: `MemoryStage` of pairs that are passed over, or None.
 
@@ -60,13 +60,11 @@ class IntersectStage(HitStage):
 
     traversal: Traversal
 
-    def __init__(self, output="any", precision="exact", with_gap=False, reads=True, reduced=False, resting=None):
+    def __init__(self, output="any", precision="exact", with_gap=False, reads=True, slots=None, resting=None):
         super().__init__()
-        self._reduced = reduced
+        self._slots = slots if with_gap else None
         self._is_exact, self._with_gap, self._reads = precision == "exact", with_gap, reads and output == "faces"
         self._mode = int(face_pairs.GAP if with_gap else PRECISIONS[precision])
-        if reduced and with_gap:
-            self._mode = int(face_pairs.NEAR_LISTED)
         self._output, self._resting = int(OUTPUTS[output]), resting
 
     def attach(self, operator: Operator):
@@ -77,21 +75,18 @@ class IntersectStage(HitStage):
         self.traversal = Traversal(operator, self._output == int(face_pairs.OUTPUT_ANY))
         self._no_distance = wp.empty(0, dtype=wp.float64, device=operator.device)
         operator.hits, operator.traversal, operator.lists_hits = self.hits, self.traversal, self._reads
-        operator.lists_apart = self._reduced and self._with_gap
 
     def kernels(self, device) -> list:
         """Return the kernels of the traversal."""
         is_any = self._output == int(face_pairs.OUTPUT_ANY)
-        return traversal_kernels(device, current_regime(), self._mode, is_any)
+        return traversal_kernels(device, current_regime(), self._mode, is_any, self._slots is not None)
 
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return the arrays of hits, and the lists of face pairs that wait."""
         waiting = rooms.uncertain if self.operator.uses_warps() else 0
-        if self._mode == int(face_pairs.NEAR_LISTED):
-            waiting = -(-waiting // APART_FOR_UNCERTAIN)
         lists = {"face": rooms.hits, "uncertain": waiting, "inexact": waiting if self._is_exact else 0}
         if self._with_gap:
-            lists["apart"] = rooms.uncertain
+            lists["apart"] = waiting
         made = [Array(self.hits, name, wp.vec3i, room) for name, room in lists.items()]
         return [*super().arrays(rooms), *self.traversal.arrays(rooms), *made]
 
@@ -105,7 +100,11 @@ class IntersectStage(HitStage):
         within = self.hits.gap if self._with_gap else self._no_distance
         if self._resting is not None:
             within = self._resting.asked
-        self.traversal.launch("pairs", within, self.hits, self._mode, self._output)
+        slots = None
+        if self._slots is not None:
+            self._slots.start()
+            slots = self._slots.slots
+        self.traversal.launch("pairs", within, self.hits, self._mode, self._output, slots)
 
     def read(self, found: Found, device: bool, with_rows: bool):
         """Read the hits as rows."""

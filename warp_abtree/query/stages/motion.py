@@ -112,7 +112,7 @@ class FirstContactStage(Stage):
 
     def kernels(self, device) -> list:
         """Return what makes motions and follows them."""
-        make = group.warp_search if current_regime().uses_warps(device) else search.thread_search
+        make = group.warp_motion_search if current_regime().uses_warps(device) else search.thread_motion_search
         kernels = make(self._kind), start.contact_starter(self._kind), path.prepare_path_kernel
         return [(kernel, WARP_SIZE) for kernel in kernels]
 
@@ -164,11 +164,11 @@ class FirstContactStage(Stage):
         inputs = [self.tolerance, operator.batch.trees, poses, operator.pair_batch, self.motion]
         inputs += [operator.hits, self.contacts]
         if not operator.uses_warps():
-            kernel = search.thread_search(self._kind)
+            kernel = search.thread_motion_search(self._kind)
             return [launch(kernel, dim=1, inputs=[*inputs, self.memory], device=operator.device)]
         inputs = [operator.traversal.stack_length(), *inputs]
         threads = {"dim": operator.rooms.pairs * operator.lanes, "block_dim": WARP_SIZE, "device": operator.device}
-        return [launch(group.warp_search(self._kind), inputs=inputs, **threads)]
+        return [launch(group.warp_motion_search(self._kind), inputs=inputs, **threads)]
 
     def read(self, found: Found, device: bool, with_rows: bool):
         """Read times and how motions end.

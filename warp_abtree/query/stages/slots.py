@@ -4,7 +4,6 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.contacts import slots
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
@@ -51,8 +50,8 @@ class SlotStage(Stage):
 
     def kernels(self, device) -> list:
         """Return what offers face pairs."""
-        offering = slots.offer_near_kernel if current_regime().uses_warps(device) else slots.offer_list_kernel
-        return [(offering, 256)] if self._with_gap else []
+        listed = self._with_gap and current_regime().uses_warps(device)
+        return [(slots.offer_near_kernel, 256)] if listed else []
 
     @staticmethod
     def room(rooms: Rooms) -> int:
@@ -63,26 +62,27 @@ class SlotStage(Stage):
         """Return the slots, and what they keep."""
         return [
             Array(self.slots, "key", wp.int64, slots.SLOT_ROOM * rooms.pairs),
-            *fields(self.slots, rooms.pairs, measures=wp.vec2, widths=wp.vec2i),
+            *fields(self.slots, rooms.pairs, weight=wp.float32, widths=wp.vec2i),
             *fields(self.rows, rooms.pairs, start=wp.int32, count=wp.int32),
             Array(self.rows, "item", wp.vec3i, self.room(rooms)),
         ]
 
-    def search(self):
-        """Reduce what is near. Launches only."""
-        self.operator.launch_all("slots", self._make)
+    def start(self):
+        """Empty the slots, before the traversal offers to them. Launches only."""
+        operator, own = self.operator, self.slots
+        inputs = [operator.batch.trees, operator.pair_batch, operator.hits.gap, operator.hits, own]
+        operator.launch_kernel(slots.start_slots_kernel, len(own.key), inputs)
 
-    def _make(self, launch) -> list:
-        operator, device, hits, own = self.operator, self.operator.device, self.operator.hits, self.slots
-        posed, threads = [operator.batch.trees, operator.pair_batch], {"block_dim": 256, "device": device}
-        made = [launch(slots.start_slots_kernel, dim=len(own.key), inputs=[*posed, hits.gap, hits, own], **threads)]
-        if self._with_gap and operator.uses_warps():
+    def search(self):
+        """Offer what later passes found apart, and reserve places for witnesses. Launches only."""
+        operator, device, found = self.operator, self.operator.device, [self.operator.pair_batch, self.slots]
+        if not self._with_gap:
+            self.start()
+        elif operator.uses_warps():
             step = OFFERING_THREADS * device.sm_count if device.is_cuda else 1
-            made.append(launch(slots.offer_near_kernel, dim=step, inputs=[step, *posed, hits, own], **threads))
-        elif self._with_gap:
-            made.append(launch(slots.offer_list_kernel, dim=1, inputs=[*posed, hits, own], **threads))
-        warps = {"dim": operator.rooms.pairs * operator.lanes, "block_dim": WARP_SIZE, "device": device}
-        return [*made, launch(slots.reserve_witness_kernel, inputs=[posed[1], own, hits, self.rows], **warps)]
+            inputs = [step, operator.batch.trees, operator.pair_batch, operator.hits, self.slots]
+            operator.launch_kernel(slots.offer_near_kernel, step, inputs)
+        operator.launch_warps(slots.reserve_witness_kernel, operator.rooms.pairs, [*found, operator.hits, self.rows])
 
     def list_witnesses(self):
         """List the witnesses, after what crosses was offered. Launches only."""

@@ -2,14 +2,15 @@
 
 import math
 from functools import partial
+from typing import Any, NamedTuple
 
 import warp as wp
 
 from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.kernels.base.lanes import WARP_SIZE
+from warp_abtree.kernels.contacts import near_search
 from warp_abtree.kernels.exact.predicates import EXACT
 from warp_abtree.kernels.intersect import (
-    descent,
     dual_tree,
     face_pairs,
     near_faces,
@@ -17,7 +18,7 @@ from warp_abtree.kernels.intersect import (
     simd,
     uncertain_pairs,
 )
-from warp_abtree.kernels.search import load_balance
+from warp_abtree.kernels.search import descent, load_balance, thread_search
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.stage import Array, Rooms
@@ -29,30 +30,35 @@ FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
 WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 
 
-def find_passes(mode: int) -> list:
+def find_passes(mode: int, reduced: bool = False) -> list:
     """Return the passes over the traversal's lists: kernels, their warps a multiprocessor, threads of a block."""
-    if mode not in (int(EXACT), int(face_pairs.GAP), int(face_pairs.NEAR_LISTED)):
+    if mode not in (int(EXACT), int(face_pairs.GAP)):
         return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS)]
+    lists_near = mode == int(face_pairs.GAP) and not reduced
     return [
         (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS),
         (uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS),
-        *([(near_faces.find_near_kernel, EXACT_WARPS_A_PROCESSOR, WARP_SIZE)] if mode == int(face_pairs.GAP) else []),
+        *([(near_faces.find_near_kernel, EXACT_WARPS_A_PROCESSOR, WARP_SIZE)] if lists_near else []),
     ]
 
 
-def mode_of_warps(mode: int) -> int:
-    """Return the mode of a traversal by warps, which list what is apart in any case."""
-    return int(face_pairs.GAP) if mode == int(face_pairs.NEAR_LISTED) else mode
+def find_search(warps: bool, mode: int, is_any: bool, reduced: bool):
+    """Return the kernel that traverses by warps, or by threads, perhaps reducing what is apart to slots."""
+    if reduced:
+        return near_search.warp_near_search() if warps else near_search.thread_near_search()
+    return dual_tree.warp_traversal(mode, is_any) if warps else simd.thread_traversal(mode)
 
 
-def traversal_kernels(device, regime, mode: int, is_any: bool) -> list:
+def traversal_kernels(device, regime, mode: int, is_any: bool, reduced: bool = False) -> list:
     """Return the kernels of a traversal with block sizes, those first that take longest to compile."""
-    if not regime.uses_warps(device):
-        return [(simd.thread_traversal(mode), WARP_SIZE)]
-    with_distances = mode in (int(face_pairs.WITHIN), int(face_pairs.GAP), int(face_pairs.NEAR_LISTED))
-    passes = [] if mode == int(face_pairs.WITHIN) else reversed(find_passes(mode))
+    warps = regime.uses_warps(device)
+    searching = find_search(warps, mode, is_any, reduced), WARP_SIZE
+    if not warps:
+        return [searching]
+    with_distances = mode in (int(face_pairs.WITHIN), int(face_pairs.GAP))
+    passes = [] if mode == int(face_pairs.WITHIN) else reversed(find_passes(mode, reduced))
     return [
-        (dual_tree.warp_traversal(mode_of_warps(mode), is_any), WARP_SIZE),
+        searching,
         *[(kernel, block) for kernel, _, block in passes],
         (relative_pose.relative_poses(with_distances), WARP_SIZE),
     ]
@@ -60,6 +66,28 @@ def traversal_kernels(device, regime, mode: int, is_any: bool) -> list:
 
 def _clear_slabs(memory: wp.array):
     memory.numpy()[:, : descent.SLAB_ZEROS] = 0.0
+
+
+class Asked(NamedTuple):
+    """What a traversal is asked for, as `Traversal.launch`."""
+
+    within: wp.array
+    hits: Any
+    mode: int
+    output: int
+    slots: Any
+
+    def kernel(self, warps: bool):
+        """Return the kernel that traverses."""
+        return find_search(warps, self.mode, self.output == int(face_pairs.OUTPUT_ANY), self.slots is not None)
+
+    def found(self):
+        """Return what it writes."""
+        if self.slots is None:
+            return self.hits
+        found = near_search.NearFound()
+        found.hits, found.slots = self.hits, self.slots
+        return found
 
 
 class Traversal:
@@ -123,7 +151,7 @@ class Traversal:
         # Each has memory for slabs: tests do not depend on which thread takes a pair.
         return cores_for(operator.rooms.pairs, least, len(self.slab_memory))
 
-    def launch(self, name: str, within: wp.array, hits, mode: int, output: int):
+    def launch(self, name: str, within: wp.array, hits, mode: int, output: int, slots=None):
         """Launch relative poses, the traversal, and passes over uncertain face pairs.
 
         Args:
@@ -131,9 +159,12 @@ class Traversal:
             within: Distances by which boxes are wider [world units], device float64 (pair,); (0,) for none.
             hits: `Hits` to write.
             mode, output: As for the kernels, `face_pairs` has them.
+            slots: `kernels.contacts.slots.Slots`, started, that what is apart is offered to in the mode GAP; None where
+                it is listed.
         """
         operator = self.operator
-        make = partial(self._make, within, hits, mode, output)
+        asked = Asked(within, hits, mode, output, slots)
+        make = partial(self._make, asked)
         if operator.device.is_capturing:
             operator.launch_all(name, make)
             return
@@ -148,51 +179,50 @@ class Traversal:
         for command in passes:
             command.launch()
 
-    def _make(self, within, hits, mode, output, launch) -> list:
+    def _make(self, asked: Asked, launch) -> list:
         """Make the launches of `launch`, see `Commands.find`."""
-        operator = self.operator
-        made = self._make_warps if operator.uses_warps() else self._make_threads
-        return made(within, hits, mode, output, launch) + self._make_passes(hits, mode, output, launch)
+        made = self._make_warps if self.operator.uses_warps() else self._make_threads
+        return made(asked, launch) + self._make_passes(asked, launch)
 
-    def _make_warps(self, within, hits, mode, output, launch) -> list:
+    def _make_warps(self, asked: Asked, launch) -> list:
         operator, device = self.operator, self.operator.device
         posed = operator.batch.trees, operator.pair_batch
         self.work.warps = self.warp_count()
         # A warp a block: few pairs lie on as many multiprocessors.
         first = launch(
-            relative_pose.relative_poses(len(within) > 0),
+            relative_pose.relative_poses(len(asked.within) > 0),
             dim=max(operator.rooms.pairs, len(self.work.flag)),
-            inputs=[output, posed[0], within, posed[1], hits, self.work],
+            inputs=[asked.output, posed[0], asked.within, posed[1], asked.hits, self.work],
             block_dim=WARP_SIZE,
             device=device,
         )
         traversal = launch(
-            dual_tree.warp_traversal(mode_of_warps(mode), output == int(face_pairs.OUTPUT_ANY)),
+            asked.kernel(True),
             dim=self.warp_count() * operator.lanes,
-            inputs=[self.stack_length(), output, *posed, hits, self.work],
+            inputs=[self.stack_length(), asked.output, *posed, asked.found(), self.work],
             block_dim=WARP_SIZE,
             device=device,
         )
         return [first, traversal]
 
-    def _make_threads(self, within, hits, mode, output, launch) -> list:
+    def _make_threads(self, asked: Asked, launch) -> list:
         """Make the launch in which a thread starts all pairs and traverses them, or one for each of the two."""
         operator, made = self.operator, []
         for starts, traverses in [(True, True)] if self._cores() == 1 else [(True, False), (False, True)]:
-            steps = relative_pose.ThreadSteps()
-            steps.within, steps.starts, steps.traverses = within, starts, traverses
-            inputs = [output, operator.batch.trees, operator.regime.plain_tests, steps, operator.pair_batch]
-            inputs += [self.slab_memory, hits, self.work]
-            made.append(launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=operator.device))
+            steps = thread_search.ThreadSteps()
+            steps.within, steps.starts, steps.traverses = asked.within, starts, traverses
+            inputs = [asked.output, operator.batch.trees, operator.regime.plain_tests, steps, operator.pair_batch]
+            inputs += [self.slab_memory, asked.found(), self.work]
+            made.append(launch(asked.kernel(False), dim=1, inputs=inputs, device=operator.device))
         return made
 
-    def _make_passes(self, hits, mode, output, launch) -> list:
-        operator, device, made = self.operator, self.operator.device, []
+    def _make_passes(self, asked: Asked, launch) -> list:
+        operator, device, made, hits = self.operator, self.operator.device, [], asked.hits
         if hits.uncertain is None or not len(hits.uncertain):
             return []
-        for kernel, warps, block in find_passes(mode):
+        for kernel, warps, block in find_passes(asked.mode, asked.slots is not None):
             threads = warps * device.sm_count * WARP_SIZE if device.is_cuda else 1
-            asked = [] if kernel is near_faces.find_near_kernel else [output]
-            inputs = [threads, *asked, operator.batch.trees, operator.pair_batch, hits]
+            output = [] if kernel is near_faces.find_near_kernel else [asked.output]
+            inputs = [threads, *output, operator.batch.trees, operator.pair_batch, hits]
             made.append(launch(kernel, dim=threads, inputs=inputs, block_dim=block, device=device))
         return made

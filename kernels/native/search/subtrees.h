@@ -1,8 +1,8 @@
 // The dual-tree traversal of the CPU inside subtrees, by slabs: as `descend`, four pairs of nodes at a time.
 #pragma once
 #include "builtin.h"
-#include "intersect/pair_lists.h"
-#include "intersect/slabs.h"
+#include "search/pair_lists.h"
+#include "search/slabs.h"
 #include "search/siblings.h"
 
 template <class ModelPool, class StatePool, class PairPose, class Descent>

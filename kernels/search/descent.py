@@ -10,7 +10,6 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
 from warp_abtree.kernels.base.poses import PairPose
-from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -132,10 +131,10 @@ def count_repeats(p: wp.int32, pair_poses: wp.array(dtype=PairPose)):
 
 
 @wp.func
-def start_descent(output: wp.int32, plain_tests: wp.int64, repeats: wp.int32, descent: wp.ref[Descent]):
+def start_descent(for_any: bool, plain_tests: wp.int64, repeats: wp.int32, descent: wp.ref[Descent]):
     """Begin a descent from the item on the stack."""
-    descent.at_once = wp.where(output == OUTPUT_ANY, ITEMS_FOR_ANY, ITEMS_AT_ONCE)
-    descent.ready = wp.where(output == OUTPUT_ANY, FACES_FOR_ANY, FACES_READY)
+    descent.at_once = wp.where(for_any, ITEMS_FOR_ANY, ITEMS_AT_ONCE)
+    descent.ready = wp.where(for_any, FACES_FOR_ANY, FACES_READY)
     descent.top = 1
     descent.deep = 0
     descent.floors = wp.vec2i(NO_FLOOR, NO_FLOOR)
@@ -143,7 +142,7 @@ def start_descent(output: wp.int32, plain_tests: wp.int64, repeats: wp.int32, de
     descent.plain_tests = plain_tests
     descent.repeats = repeats
     # An early hit ends `any`.
-    descent.cost = wp.where(output == OUTPUT_ANY or repeats == 0, NEVER, wp.int64(-1))
+    descent.cost = wp.where(for_any or repeats == 0, NEVER, wp.int64(-1))
     descent.looks = wp.where(descent.cost == NEVER, plain_tests, plain_tests / wp.int64(3))
 
 
