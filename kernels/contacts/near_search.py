@@ -1,7 +1,7 @@
-"""Contact witnesses as policies of the search: what is apart but may be near is offered to slots where it is found.
+"""Contact witnesses as a policy of the search by threads: what is apart but may be near is offered to slots at once.
 
-Hits are those of a search for faces that intersect. Nothing that is apart is listed, but for face pairs that float32
-leaves uncertain by warps, which wait for later passes.
+Hits are those of a search for faces that intersect; nothing that is apart is listed. Warps list what is apart, and
+offer it in a launch of its own, which takes half of the time of offers between the tests of a traversal.
 """
 
 import functools
@@ -10,18 +10,13 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
-from warp_abtree.kernels.base.lanes import warp_lane
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
-from warp_abtree.kernels.contacts.slots import Slots, offer_pair
-from warp_abtree.kernels.intersect import dual_tree, simd
-from warp_abtree.kernels.intersect.face_pairs import GAP, OUTPUT_ANY, Hits
-from warp_abtree.kernels.intersect.leaf_pairs import report_straddling, separate_leaf_pairs, take_straddling
+from warp_abtree.kernels.contacts.slots import Slots
+from warp_abtree.kernels.intersect import simd
+from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, Hits
 from warp_abtree.kernels.intersect.relative_pose import pairs_starter
-from warp_abtree.kernels.search.item import item_first, item_second
 from warp_abtree.kernels.search.load_balance import Work
 from warp_abtree.kernels.search.thread_search import FaceTests, ThreadPolicy, thread_search
-from warp_abtree.kernels.search.warp_search import TraversalTests, WarpPolicy, warp_search
-from warp_abtree.kernels.search.warp_stack import WarpLists
 
 wp.set_module_options(native.options("contacts/near_offer.cuh", "contacts/offer_list.h"))
 
@@ -32,59 +27,6 @@ class NearFound:
 
     hits: Hits  # those that intersect
     slots: Slots  # what those that are apart are offered to
-
-
-@functools.cache
-def warp_near_search():
-    """Return the kernel that has warps share the object pairs."""
-
-    @wp.func
-    def try_small(
-        output: wp.int32,
-        slot: wp.int32,
-        task: wp.vec3i,
-        count: wp.int32,
-        trees: Trees,
-        pose: PairPose,
-        items: wp.uint64,
-        found: NearFound,
-        work: Work,
-    ):
-        return False
-
-    @wp.func
-    def separate(own: wp.ref[WarpLists], popped: wp.int32, trees: Trees, pose: PairPose):
-        separate_leaf_pairs(GAP, own, popped, trees, pose)
-
-    @wp.func
-    def test(
-        output: wp.int32,
-        own: wp.ref[WarpLists],
-        popped: wp.int32,
-        pair: wp.int32,
-        trees: Trees,
-        pose: PairPose,
-        found: NearFound,
-    ):
-        """Test straddling pairs, report those that meet or are uncertain, and offer those that are apart."""
-        item, meet = take_straddling(GAP, own, popped, trees, pose)
-        taken = warp_lane() < popped
-        if meet == 0 and taken:
-            offer_pair(trees, pose, pair, item_first(item), item_second(item), found.hits.gap, found.slots)
-        return report_straddling(output, taken, meet, item, pair, pose.swapped, found.hits)
-
-    @wp.func
-    def has_hit(pair: wp.int32, found: NearFound):
-        return dual_tree.pair_has_hit(pair, found.hits)
-
-    @wp.func
-    def add_tests(pair: wp.int32, tests: TraversalTests, found: NearFound):
-        dual_tree.add_pair_tests(pair, tests, found.hits)
-
-    policy = WarpPolicy(
-        ("contacts/near_offer.cuh",), False, True, NearFound, try_small, separate, test, has_hit, add_tests
-    )
-    return warp_search(policy)
 
 
 @native.func_native(cpu=True)

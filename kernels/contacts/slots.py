@@ -172,7 +172,7 @@ def offer_pair(
 
 @wp.kernel
 def offer_near_kernel(step: wp.int32, trees: Trees, batch: PairBatch, hits: Hits, slots_inout: Slots):
-    """Offer the face pairs that later passes found apart to the slots of their object pairs, in a grid-stride loop."""
+    """Offer the face pairs that are listed as apart to the slots of their object pairs, in a grid-stride loop."""
     i = wp.tid()
     end = wp.int32(wp.min(wp.uint32(hits.apart_total[0]), wp.uint32(hits.apart.shape[0])))
     while i < end:

@@ -53,7 +53,7 @@ def hit_policy(mode: int, for_any: bool) -> WarpPolicy:
         found: Hits,
         work: Work,
     ):
-        """Compare all leaves of two small trees; return whether they were."""
+        """Compare all leaves of two small trees; return 0, or the parts of a pair for the search."""
         lists = SmallLists()
         if wp.static(mode == int(EXACT)):
             if slot < 0 and is_small(pose, work.small_faces):
@@ -62,7 +62,7 @@ def hit_policy(mode: int, for_any: bool) -> WarpPolicy:
         if lists.fits:
             asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
             test_small_trees(asked, wp.static(for_any), task, lists, trees, pose, items, found)
-        return lists.fits
+        return wp.where(lists.fits, 0, task[2])
 
     @wp.func
     def separate(own: wp.ref[WarpLists], popped: wp.int32, trees: Trees, pose: PairPose):

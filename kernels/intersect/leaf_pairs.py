@@ -54,41 +54,6 @@ def separate_leaf_pairs(
 
 
 @wp.func
-def take_straddling(mode: wp.int32, own: wp.ref[WarpLists], popped: wp.int32, trees: Trees, pose: PairPose):
-    """Test so many of the last straddling pairs, one a lane; return the pair of this lane, and whether it meets.
-
-    With a gap pairs straddle that no plane parts by more than that. Lanes beyond have the last pair, too.
-    """
-    lane = warp_lane()
-    own.straddling -= popped
-    at = own.straddling + wp.min(lane, popped - 1)
-    item = read_item(own.items, STRADDLING_START + at)
-    signs = read_signs(own.items, at)
-    meet = try_straddling_faces(mode, trees, pose, item_first(item), item_second(item), signs)
-    return item, meet
-
-
-@wp.func
-def report_straddling(
-    output: wp.int32, taken: bool, meet: wp.int32, item: wp.int64, pair: wp.int32, swapped: wp.int32, hits: Hits
-):
-    """Report this lane's pair, if it has taken one; return whether it meets, and whether it is uncertain."""
-    meet = wp.where(taken, meet, 0)
-    warp_sync()
-    found = meet == 1
-    if output == OUTPUT_FACES:
-        slot = reserve_slot(hits.total, found)
-        if found:
-            report_hit(slot, pair, swapped, item_first(item), item_second(item), hits)
-    if found:
-        hits.any_hit[pair] = 1
-    slot = reserve_slot(hits.uncertain_total, meet == UNCERTAIN)
-    if meet == UNCERTAIN:
-        defer_uncertain(slot, pair, item_first(item), item_second(item), hits)
-    return found, meet == UNCERTAIN
-
-
-@wp.func
 def test_straddling(
     output: wp.int32,
     mode: wp.int32,
@@ -99,12 +64,31 @@ def test_straddling(
     pose: PairPose,
     hits: Hits,
 ):
-    """Test straddling pairs as `take_straddling`, and report them; with a gap those that are apart are listed."""
-    item, meet = take_straddling(mode, own, popped, trees, pose)
-    taken = warp_lane() < popped
+    """Test straddling pairs, one a lane; return whether this lane's meets, and whether it is uncertain.
+
+    With a gap pairs straddle that no plane parts by more than that, and those that are apart are listed.
+    """
+    lane = warp_lane()
+    own.straddling -= popped
+    at = own.straddling + wp.min(lane, popped - 1)
+    item = read_item(own.items, STRADDLING_START + at)
+    signs = read_signs(own.items, at)
+    meet = try_straddling_faces(mode, trees, pose, item_first(item), item_second(item), signs)
     if mode == GAP:
-        apart = meet == 0 and taken
+        apart = meet == 0 and lane < popped
         slot = reserve_slot(hits.apart_total, apart)
         if apart:
             list_apart(slot, pair, item_first(item), item_second(item), hits)
-    return report_straddling(output, taken, meet, item, pair, pose.swapped, hits)
+    meet = wp.where(lane < popped, meet, 0)
+    warp_sync()
+    found = meet == 1
+    if output == OUTPUT_FACES:
+        slot = reserve_slot(hits.total, found)
+        if found:
+            report_hit(slot, pair, pose.swapped, item_first(item), item_second(item), hits)
+    if found:
+        hits.any_hit[pair] = 1
+    slot = reserve_slot(hits.uncertain_total, meet == UNCERTAIN)
+    if meet == UNCERTAIN:
+        defer_uncertain(slot, pair, item_first(item), item_second(item), hits)
+    return found, meet == UNCERTAIN

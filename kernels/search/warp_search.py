@@ -83,7 +83,8 @@ class WarpPolicy(NamedTuple):
         for_any: Whether one hit ends a pair.
         always_donates: Whether warps give work away whatever the sizes of trees are.
         found: Struct of what is found.
-        try_small: (output, slot, task, count, trees, pose, items, found, work) -> whether it has done the unit itself.
+        try_small: (output, slot, task, count, trees, pose, items, found, work) -> the parts of a pair for the search,
+            of a task (pair, part, parts), 0 where the part is done.
         separate: (own, popped, trees, pose): takes leaf pairs, and lets some wait as straddling pairs.
         test: (output, own, popped, pair, trees, pose, found) -> whether this lane's straddling pair is a hit, and
             whether it is uncertain.
@@ -279,7 +280,9 @@ def warp_search(policy: WarpPolicy):
             task = wp.vec3i(p, unit - p * parts, parts)
             unit = claim_ahead(ended, unit, units, work_inout)
             pose = batch.poses[p]
-            if not try_small(output, slot, task, count, trees, pose, own.items, found_inout, work_inout):
+            left = try_small(output, slot, task, count, trees, pose, own.items, found_inout, work_inout)
+            if left > 0:
+                task[2] = left
                 pose.floor = slab_floor(pose, parts)
                 own.end = first_items(own.items, slot, task, pose, work_inout)
                 search_items(output, pace, p, trees, pose, own, found_inout, work_inout)

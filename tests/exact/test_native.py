@@ -147,7 +147,7 @@ def reached(adjoint, found):
 
 
 MAKERS = {
-    "contacts.near_search": [lambda made: made.warp_near_search(), lambda made: made.thread_near_search()],
+    "contacts.near_search": [lambda made: made.thread_near_search()],
     "contacts.points": [lambda made: made.point_chooser(4)],
     "intersect.dual_tree": [lambda made: made.warp_traversal(int(EXACT), False)],
     "intersect.relative_pose": [lambda made: made.relative_poses(False)],

@@ -253,6 +253,6 @@ def test_only_faces_about_the_nearest_are_contacts_ahead(device):
     reach = np.linalg.norm(dynamics.bodies.reach.numpy()[1][:3])
     assert gap < reach
     near = ab.ContactQuery(dynamics.scene, [(0, 1)], gap=[gap]).run()
-    listed = query.hits.apart_total.numpy()[0]
     far = ab.ContactQuery(dynamics.scene, [(0, 1)], gap=[reach]).run()
-    assert 0 < near.count[0] <= listed < far.count[0] > 1.5 * near.count[0]
+    tested = query.hits.triangle_tests.numpy()[0]
+    assert 0 < near.count[0] <= tested < far.count[0] > 1.5 * near.count[0]

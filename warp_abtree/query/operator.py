@@ -66,6 +66,7 @@ class Operator(DeviceMemory):
     broad_phase: Any = None
     near: Any = None
     hits: Any
+    lists_apart = False  # whether warps list all face pairs that are apart and may be near
     counts: wp.array
     traversal: Any
     lists_hits = False

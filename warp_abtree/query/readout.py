@@ -10,6 +10,7 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.io import results as kernels
+from warp_abtree.query.request import APART_FOR_UNCERTAIN
 from warp_abtree.query.result import COUNTERS, Found, Result, Totals
 from warp_abtree.query.sorting import HitSort, first_sort, sort_rows
 from warp_abtree.query.staging import Staging, first_rows, view_memory
@@ -18,6 +19,11 @@ from warp_abtree.query.staging import Staging, first_rows, view_memory
 ROWS_STEP = 1024
 FLOAT64_ROW = 1 + COUNTERS.index("float64_tests")
 HEADER, COLUMNS = int(kernels.HEADER_WORDS), int(kernels.COUNT_COLUMNS)
+
+
+def waiting_demand(operator: Any, apart: int, uncertain: int) -> int:
+    """Return the room that an operator's lists need for face pairs that are apart, and that are uncertain."""
+    return max(apart, uncertain * (APART_FOR_UNCERTAIN if operator.lists_apart else 1))
 
 
 def readout_kernels(device, output: str) -> list:
@@ -118,7 +124,8 @@ class Readout:
         if operator.output == "faces":
             total = max(int(views.counts[0].sum()), self._read_count(hits.witness_total))
         if operator.rooms.uncertain:
-            uncertain = max(int(views.counts[FLOAT64_ROW].sum()), self._read_count(hits.apart_total))
+            apart, waiting = self._read_count(hits.apart_total), int(views.counts[FLOAT64_ROW].sum())
+            uncertain = waiting_demand(operator, apart, waiting)
         return Totals(operator.guard.outcome(), self._pair_count(int(views.pair_count[0])), total, uncertain)
 
     @staticmethod
@@ -135,8 +142,9 @@ class Readout:
         """Return the demands in a header; those of lists that the operator lacks are 0."""
         launched, found, total, uncertain, apart, witnesses = words[:HEADER].tolist()
         total = max(total, witnesses)
-        listed, waits = self.operator.output == "faces", self.operator.rooms.uncertain
-        demand = max(apart, uncertain) if waits else 0
+        operator = self.operator
+        listed, waits = operator.output == "faces", operator.rooms.uncertain
+        demand = waiting_demand(operator, apart, uncertain) if waits else 0
         return Totals(launched, self._pair_count(found), total if listed else 0, demand)
 
     def read_pairs(self, device: bool) -> Found:

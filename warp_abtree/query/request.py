@@ -30,6 +30,10 @@ class CapacityError(RuntimeError):
     """A buffer was too small and work was lost; the message names the demand."""
 
 
+# Where all face pairs that may be near are listed, those that are uncertain have this part of the room.
+APART_FOR_UNCERTAIN = 4
+
+
 @dataclass(frozen=True)
 class Buffers:
     """Room of a query's lists; None is a guess. `run()` makes more room, `launch()` cannot.
@@ -38,8 +42,9 @@ class Buffers:
         hits: Intersecting face pairs, where they are listed; of a `ManifoldQuery` also witnesses, at most 380 an object
             pair.
         pairs: Object pairs; by default those given, or a guess for the broad phase.
-        uncertain: Face pairs between float32 and the later stages, and with a gap as many that are apart. Not needed on
-            the CPU.
+        uncertain: Face pairs between float32 and the later stages, and with a gap as many that are apart. Of a
+            `ManifoldQuery` with a gap, face pairs that may be near; those between stages have a quarter of it. Not
+            needed on the CPU.
 
     Raises:
         ValueError: A number that is out of range.

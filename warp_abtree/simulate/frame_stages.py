@@ -14,6 +14,7 @@ from warp_abtree.kernels.lod.ladder import WARP
 from warp_abtree.kernels.update import levels as level_kernels
 from warp_abtree.kernels.update import work_lists
 from warp_abtree.lod.controllers import Controller
+from warp_abtree.query.readout import waiting_demand
 from warp_abtree.query.stages.contacts import ContactQuery
 from warp_abtree.query.stages.intersect import Query
 from warp_abtree.scene.scene import Scene
@@ -210,5 +211,5 @@ class FrameStages:
             found["launched"] >= 0
             and 0 <= found["pairs"] <= len(query.pairs)
             and (query.output != "faces" or max(found["hits"], found["witnesses"]) <= len(query.hits.face))
-            and (not room or max(found["apart"], found["uncertain"]) <= room)
+            and (not room or waiting_demand(query, found["apart"], found["uncertain"]) <= room)
         )

@@ -125,7 +125,8 @@ class ContactStage(Stage):
         """Return what finds contacts, and what sorts."""
         if not current_regime().uses_warps(device):
             finding = contact.find_pair_contacts_kernel, contact.find_deferred_kernel
-            return [*((kernel, WARP_SIZE) for kernel in finding), (sort_hits.sort_by_pair_kernel, 256)]
+            sums = [(summary.sum_pair_kernel, 256)] if self._sums_contacts else []
+            return [*((kernel, WARP_SIZE) for kernel in finding), *sums, (sort_hits.sort_by_pair_kernel, 256)]
         finding = contact.find_contact_kernel, summary.sum_loop_kernel
         return [*((kernel, WARP_SIZE) for kernel in finding), *first_sort(device)]
 

@@ -6,7 +6,7 @@ import warp as wp
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.intersect import face_pairs, near_faces
 from warp_abtree.query.operator import Operator
-from warp_abtree.query.request import OUTPUTS, PRECISIONS, check_gap, check_request
+from warp_abtree.query.request import APART_FOR_UNCERTAIN, OUTPUTS, PRECISIONS, check_gap, check_request
 from warp_abtree.query.result import COUNTERS, Found
 from warp_abtree.query.stage import Array, PairDistance, Rooms, Stage
 from warp_abtree.query.stages.inside import InsideStage
@@ -75,6 +75,7 @@ class IntersectStage(HitStage):
         self.traversal = Traversal(operator, self._output == int(face_pairs.OUTPUT_ANY))
         self._no_distance = wp.empty(0, dtype=wp.float64, device=operator.device)
         operator.hits, operator.traversal, operator.lists_hits = self.hits, self.traversal, self._reads
+        operator.lists_apart = self._slots is not None
 
     def kernels(self, device) -> list:
         """Return the kernels of the traversal."""
@@ -84,9 +85,11 @@ class IntersectStage(HitStage):
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return the arrays of hits, and the lists of face pairs that wait."""
         waiting = rooms.uncertain if self.operator.uses_warps() else 0
+        if self._slots is not None:
+            waiting = -(-waiting // APART_FOR_UNCERTAIN)
         lists = {"face": rooms.hits, "uncertain": waiting, "inexact": waiting if self._is_exact else 0}
         if self._with_gap:
-            lists["apart"] = waiting
+            lists["apart"] = rooms.uncertain if self.operator.uses_warps() else 0
         made = [Array(self.hits, name, wp.vec3i, room) for name, room in lists.items()]
         return [*super().arrays(rooms), *self.traversal.arrays(rooms), *made]
 

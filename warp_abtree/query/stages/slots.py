@@ -74,7 +74,7 @@ class SlotStage(Stage):
         operator.launch_kernel(slots.start_slots_kernel, len(own.key), inputs)
 
     def search(self):
-        """Offer what later passes found apart, and reserve places for witnesses. Launches only."""
+        """Offer what is listed as apart, and reserve places for witnesses. Launches only."""
         operator, device, found = self.operator, self.operator.device, [self.operator.pair_batch, self.slots]
         if not self._with_gap:
             self.start()

@@ -43,10 +43,10 @@ def find_passes(mode: int, reduced: bool = False) -> list:
 
 
 def find_search(warps: bool, mode: int, is_any: bool, reduced: bool):
-    """Return the kernel that traverses by warps, or by threads, perhaps reducing what is apart to slots."""
-    if reduced:
-        return near_search.warp_near_search() if warps else near_search.thread_near_search()
-    return dual_tree.warp_traversal(mode, is_any) if warps else simd.thread_traversal(mode)
+    """Return the kernel that traverses by warps, or by threads, which may reduce what is apart to slots."""
+    if warps:
+        return dual_tree.warp_traversal(mode, is_any)
+    return near_search.thread_near_search() if reduced else simd.thread_traversal(mode)
 
 
 def traversal_kernels(device, regime, mode: int, is_any: bool, reduced: bool = False) -> list:
@@ -81,9 +81,9 @@ class Asked(NamedTuple):
         """Return the kernel that traverses."""
         return find_search(warps, self.mode, self.output == int(face_pairs.OUTPUT_ANY), self.slots is not None)
 
-    def found(self):
+    def found(self, warps: bool):
         """Return what it writes."""
-        if self.slots is None:
+        if warps or self.slots is None:
             return self.hits
         found = near_search.NearFound()
         found.hits, found.slots = self.hits, self.slots
@@ -159,8 +159,8 @@ class Traversal:
             within: Distances by which boxes are wider [world units], device float64 (pair,); (0,) for none.
             hits: `Hits` to write.
             mode, output: As for the kernels, `face_pairs` has them.
-            slots: `kernels.contacts.slots.Slots`, started, that what is apart is offered to in the mode GAP; None where
-                it is listed.
+            slots: `kernels.contacts.slots.Slots`, started, where what is apart is reduced: threads offer it to them,
+                warps list it. None where it is reported.
         """
         operator = self.operator
         asked = Asked(within, hits, mode, output, slots)
@@ -199,7 +199,7 @@ class Traversal:
         traversal = launch(
             asked.kernel(True),
             dim=self.warp_count() * operator.lanes,
-            inputs=[self.stack_length(), asked.output, *posed, asked.found(), self.work],
+            inputs=[self.stack_length(), asked.output, *posed, asked.found(True), self.work],
             block_dim=WARP_SIZE,
             device=device,
         )
@@ -212,7 +212,7 @@ class Traversal:
             steps = thread_search.ThreadSteps()
             steps.within, steps.starts, steps.traverses = asked.within, starts, traverses
             inputs = [asked.output, operator.batch.trees, operator.regime.plain_tests, steps, operator.pair_batch]
-            inputs += [self.slab_memory, asked.found(), self.work]
+            inputs += [self.slab_memory, asked.found(False), self.work]
             made.append(launch(asked.kernel(False), dim=1, inputs=inputs, device=operator.device))
         return made
 
