@@ -32,6 +32,11 @@ def next_place(end: wp.ref[wp.int32], flag: bool) -> wp.int32:
 
 
 @native.func_native()
+def vote_lanes(flag: bool) -> wp.uint32:
+    """Return a word with the bit of each lane that has set its flag."""
+
+
+@native.func_native()
 def count_lanes(flag: bool) -> wp.int32:
     """Return how many lanes have set their flag."""
 

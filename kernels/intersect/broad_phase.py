@@ -1,4 +1,4 @@
-"""Candidate object pairs: posed root boxes in a wp.Bvh grouped by world."""
+"""Candidate object pairs: posed root boxes in the world, and which objects may be a pair."""
 
 import warp as wp
 
@@ -11,8 +11,40 @@ from warp_abtree.kernels.base.poses import ROUNDING_64, measure_skew
 
 wp.set_module_options(native.options())
 
+MIDDLE_MAX = wp.constant(wp.float32(2.0**100))
 # Of sums of lengths in float64.
 REACH_ROUNDING = wp.constant(wp.float64(1.0 + 2.0**-48))
+
+
+@wp.struct
+class PosedBounds:
+    """Boxes of objects in the world, and how many pairs of them were found."""
+
+    lower: wp.array(dtype=wp.vec3)  # shape [object]
+    upper: wp.array(dtype=wp.vec3)  # shape [object]
+    pair_count: wp.array(dtype=wp.int32)  # perhaps more than there is room for, below 0 where it overflowed, shape [1]
+
+
+@wp.struct
+class PairFilter:
+    """Which objects may be a pair."""
+
+    shared_group: wp.int32  # group of the objects that are in every world, -1 if there is none
+    group: wp.array(dtype=wp.int32)  # of each object; worlds are numbered from 0, what is in every world first
+    excluded: wp.array(dtype=wp.int64)  # sorted keys i * 2^32 + j, i < j
+    collision_bits: wp.array(dtype=wp.vec2ui)  # group and mask of each object; [0] where they keep no pair apart
+
+
+@wp.func
+def write_bounds(i: wp.int32, lower: wp.vec3, upper: wp.vec3, boxes: PosedBounds):
+    """Write the box of an object, infinite where it is no number; the first one starts the count of pairs."""
+    for k in range(3):
+        lower[k] = wp.where(lower[k] == lower[k], lower[k], -wp.inf)
+        upper[k] = wp.where(upper[k] == upper[k], upper[k], wp.inf)
+    boxes.lower[i] = lower
+    boxes.upper[i] = upper
+    if i == 0:
+        boxes.pair_count[0] = 0
 
 
 @wp.kernel
@@ -21,8 +53,7 @@ def pose_box_kernel(
     record: LaunchRecord,
     wide: wp.float64,
     reach: wp.array(dtype=wp.vec4d),
-    lower_out: wp.array(dtype=wp.vec3),
-    upper_out: wp.array(dtype=wp.vec3),
+    boxes_out: PosedBounds,
 ):
     """Box the posed root box of each object in the world, rounded outwards; a stale launch boxes points apart.
 
@@ -62,80 +93,43 @@ def pose_box_kernel(
     if is_stale(record):
         box_lower = wp.vec3(wp.float32(i), 0.0, 0.0)
         box_upper = box_lower
-    lower_out[i] = box_lower
-    upper_out[i] = box_upper
+    write_bounds(i, box_lower, box_upper, boxes_out)
 
 
 @wp.func
-def append_pair(
-    i: wp.int32,
-    j: wp.int32,
-    objects: ObjectPool,
-    excluded: wp.array(dtype=wp.int64),
-    collision_bits: wp.array(dtype=wp.vec2ui),
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-):
-    """Append (min, max) unless both are static, their bits forbid it, or the user excluded it.
-
-    The count goes on past the capacity.
-    """
+def may_pair(i: wp.int32, j: wp.int32, filter: PairFilter, objects: ObjectPool):
+    """Return whether two objects are not both static, and neither their bits nor the user forbid the pair."""
     if objects.is_static[i] != 0 and objects.is_static[j] != 0:
-        return
-    if collision_bits.shape[0] > 0:
-        a = collision_bits[i]
-        b = collision_bits[j]
+        return False
+    if filter.collision_bits.shape[0] > 0:
+        a = filter.collision_bits[i]
+        b = filter.collision_bits[j]
         if (a[0] & b[1]) == wp.uint32(0) or (b[0] & a[1]) == wp.uint32(0):
-            return
-    low = wp.min(i, j)
-    high = wp.max(i, j)
-    if excluded.shape[0] > 0:
-        key = (wp.int64(low) << wp.int64(32)) + wp.int64(high)
-        at = wp.lower_bound(excluded, key)
-        if at < excluded.shape[0] and excluded[at] == key:
-            return
-    slot = wp.atomic_add(pair_count, 0, 1)
+            return False
+    if filter.excluded.shape[0] > 0:
+        key = pair_key(wp.vec2i(wp.min(i, j), wp.max(i, j)))
+        at = wp.lower_bound(filter.excluded, key)
+        if at < filter.excluded.shape[0] and filter.excluded[at] == key:
+            return False
+    return True
+
+
+@wp.func
+def write_pair(slot: wp.int32, i: wp.int32, j: wp.int32, pairs: wp.array(dtype=wp.vec2i)):
+    """Write (min, max) if there is room."""
     if slot >= 0 and slot < pairs.shape[0]:
-        pairs[slot] = wp.vec2i(low, high)
+        pairs[slot] = wp.vec2i(wp.min(i, j), wp.max(i, j))
 
 
-@wp.kernel
-def find_pair_kernel(
-    shared_group: wp.int32,
-    bvh: wp.uint64,
-    lower: wp.array(dtype=wp.vec3),
-    upper: wp.array(dtype=wp.vec3),
-    group: wp.array(dtype=wp.int32),
-    excluded: wp.array(dtype=wp.int64),
-    collision_bits: wp.array(dtype=wp.vec2ui),
-    objects: ObjectPool,
-    pair_count_inout: wp.array(dtype=wp.int32),
-    pairs_out: wp.array(dtype=wp.vec2i),
-):
-    """Find the partners of each object: in its own world larger indices and what is static, and all in every world.
-
-    What is static finds none in its world: it may be large, and one thread would meet all others.
-
-    Args:
-        shared_group: Group of the objects that are in every world, -1 if there is none.
-        group: Group of each object; worlds are renumbered from 0.
-        excluded: Sorted keys i * 2^32 + j, i < j.
-        collision_bits: Collision group and mask of each object; empty where they keep no pair apart.
-    """
-    i = wp.tid()
-    j = wp.int32(0)
-    if objects.is_static[i] == 0:
-        # The root of a missing group would be -1, which means the whole tree; an object's own group always exists.
-        root = wp.bvh_get_group_root(bvh, group[i])
-        query = wp.bvh_query_aabb(bvh, lower[i], upper[i], root)
-        while wp.bvh_query_next(query, j):
-            if j > i or objects.is_static[j] != 0:
-                append_pair(i, j, objects, excluded, collision_bits, pair_count_inout, pairs_out)
-    if shared_group >= 0 and group[i] != shared_group:
-        root = wp.bvh_get_group_root(bvh, shared_group)
-        query = wp.bvh_query_aabb(bvh, lower[i], upper[i], root)
-        while wp.bvh_query_next(query, j):
-            append_pair(i, j, objects, excluded, collision_bits, pair_count_inout, pairs_out)
+@wp.func
+def box_middle(boxes: PosedBounds, i: wp.int32):
+    """Return the middle of an object's box, moved into the range of what float32 computes with."""
+    middle = wp.vec3()
+    for k in range(3):
+        x = wp.float32(0.5) * boxes.lower[i][k] + wp.float32(0.5) * boxes.upper[i][k]
+        # What is no number lies between infinite ends.
+        middle[k] = wp.where(x == x, wp.clamp(x, -MIDDLE_MAX, MIDDLE_MAX), wp.float32(0.0))
+    return middle
 
 
 @wp.kernel

@@ -16,6 +16,7 @@ from warp_abtree.kernels.base.boxes import round_down, round_up
 from warp_abtree.kernels.base.generation import STALE, LaunchRecord, is_stale
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import ROUNDING_64, PairBatch, PairPose, measure_skew
+from warp_abtree.kernels.intersect.broad_phase import PosedBounds, write_bounds
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED
 from warp_abtree.kernels.motion.kinds import advance_nodes, has_way, make_motion
@@ -133,8 +134,7 @@ def sweep_box_kernel(
     trees: Trees,
     ends: ObjectPool,
     record: LaunchRecord,
-    lower_out: wp.array(dtype=wp.vec3),
-    upper_out: wp.array(dtype=wp.vec3),
+    boxes_out: PosedBounds,
 ):
     """Box the root box of each object on its way in the world; as `broad_phase.pose_box_kernel`."""
     i = wp.tid()
@@ -167,5 +167,4 @@ def sweep_box_kernel(
     if is_stale(record):
         box_lower = wp.vec3(wp.float32(i), 0.0, 0.0)
         box_upper = box_lower
-    lower_out[i] = box_lower
-    upper_out[i] = box_upper
+    write_bounds(i, box_lower, box_upper, boxes_out)

@@ -164,7 +164,7 @@ class Interruption(Fault):
         super().__init__(device)
         allocator = wp.get_device(device).get_allocator()
         steps = [(wp, "launch"), (wp.Launch, "launch"), (wp, "copy")]
-        steps += [(wp.utils, "radix_sort_pairs"), (wp.Bvh, "rebuild")]
+        steps += [(wp.utils, "radix_sort_pairs")]
         steps += [(wp.array, "fill_"), (wp.array, "zero_"), (wp.array, "assign"), (allocator, "allocate")]
         for owner, name in steps:
             monkeypatch.setattr(owner, name, self._counted(getattr(owner, name)))

@@ -5,6 +5,8 @@ from fractions import Fraction
 import hypothesis.strategies as st
 import numpy as np
 import pytest
+import trimesh
+import warp as wp
 from helpers.questions import sort_rows, to_matrix
 from helpers.samples import STILL, random_poses, raw_state, sample
 from helpers.scenes import scene_with
@@ -12,9 +14,22 @@ from hypothesis import HealthCheck, given, settings
 from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
+from warp_abtree import testing
+from warp_abtree.kernels.intersect.broad_phase import PosedBounds, write_bounds
+from warp_abtree.query.broad_phase import BroadPhase
 
 NAMES = ("box", "crumbs", "grid", "three")
 CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), -1).reshape(-1, 3)
+
+
+REGIMES = {"as by default": {}, "tiles": {"warps": True}, "tiles along a curve": {"warps": True, "tile_tasks": 0}}
+
+
+@pytest.fixture(params=REGIMES, autouse=True)
+def search(request):
+    """Find pairs as the device does, and in tiles of one object on the CPU, sorted or not."""
+    with testing.regime(**REGIMES[request.param]):
+        yield request.param
 
 
 def posed_boxes(scene, poses):
@@ -31,7 +46,7 @@ def posed_boxes(scene, poses):
 
 def overlaps(lower, upper, slack):
     """Return which boxes overlap when each is widened by slack times its largest coordinate, bool (n, n)."""
-    room = slack * np.maximum(np.abs(lower), np.abs(upper)).max(1)[:, None]
+    room = slack and slack * np.maximum(np.abs(lower), np.abs(upper)).max(1)[:, None]
     lower, upper = lower - room, upper + room
     return ((lower[:, None] <= upper) & (upper[:, None] >= lower)).all(2)
 
@@ -143,6 +158,69 @@ def test_boxes_in_the_world_contain_what_they_box(device, far):
         for lower, upper, least, most in zip(boxes[0][i], boxes[1][i], *exact_box(scene, i, pose), strict=True):
             assert least - 4 * room < Fraction(lower) < least
             assert most < Fraction(upper) < most + 4 * room
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_boxes_of_all_sizes(device, seed):
+    """From a thousandth to one that holds all, in worlds of 1 to 500 objects with gaps between their numbers."""
+    rng = np.random.default_rng(seed)
+    sizes = 10.0 ** rng.uniform(-2, 0.3, 700)
+    sizes[rng.integers(0, 700, 3)] = 60.0
+    worlds = rng.choice([-1, 0, 5, 6, 7, 2**31 - 1], 700, p=[0.01, 0.7, 0.1, 0.1, 0.08, 0.01])
+    statics = rng.random(700) < 0.2
+    scene, models = ab.Scene(device), {}
+    poses = random_poses(rng, 700, 5.0)
+    for size, pose, world, static in zip(sizes, poses, worlds, statics):
+        key = round(float(np.log10(size)), 1)
+        if key not in models:
+            models[key] = ab.Model.load(trimesh.creation.box((10**key,) * 3))
+        scene.add(models[key], pose, int(world), static=bool(static))
+    assert len(check_pairs(scene, poses, worlds, statics)) > 700
+
+
+@wp.kernel
+def copy_bounds_kernel(lower: wp.array(dtype=wp.vec3), upper: wp.array(dtype=wp.vec3), boxes_out: PosedBounds):
+    write_bounds(wp.tid(), lower[wp.tid()], upper[wp.tid()], boxes_out)
+
+
+class GivenBoxes:
+    """Boxes of objects as a test wants them."""
+
+    def __init__(self, lower, upper, device):
+        self.ends = [wp.array(end, dtype=wp.vec3, device=device) for end in (lower, upper)]
+
+    def given(self):
+        return ()
+
+    def make(self, launch, guard, boxes):
+        return launch(copy_bounds_kernel, dim=len(boxes.lower), inputs=[*self.ends, boxes], device=boxes.lower.device)
+
+
+@pytest.mark.parametrize("count", [1, 2, 33, 100, 517])
+def test_closed_boxes_in_whole_numbers(device, count):
+    """Many touch in a face, an edge or a corner; some are points, some infinite, or no numbers."""
+    rng, scene = np.random.default_rng(count), ab.Scene(device)
+    worlds = rng.integers(-1, 3, count)
+    scene.add_many(sample("box"), np.tile(STILL, (count, 1)), worlds)
+    lower = rng.integers(-9, 9, (count, 3)).astype(np.float32)
+    upper = lower + rng.integers(0, 4, (count, 3))
+    open_lower, open_upper = rng.random((2, count, 3)) < 0.02
+    lower[open_lower], upper[open_upper] = -np.inf, np.inf
+    given = np.where(open_lower & (rng.random((count, 3)) < 0.5), np.nan, lower)
+    broad_phase = BroadPhase(scene.batch(), boxes=GivenBoxes(given, upper, scene.device))
+    may = np.triu((worlds[:, None] == worlds) | (worlds[:, None] == -1) | (worlds == -1), 1)
+    np.testing.assert_array_equal(broad_phase.find(), np.argwhere(may & overlaps(lower, upper, 0.0)))
+
+
+@pytest.mark.slow
+def test_more_pairs_than_can_be_numbered(device, search):
+    """100,000 objects in one place: one error, and no count that has gone round."""
+    if search != "as by default" and not wp.get_device(device).is_cuda:
+        pytest.skip("tiles of one object")
+    scene = ab.Scene(device)
+    scene.add_many(sample("box"), np.tile(STILL, (100_000, 1)))
+    with pytest.raises(ab.CapacityError, match="2\\^31 object pairs or more"):
+        scene.broad_phase()
 
 
 def test_thousand_worlds(device):

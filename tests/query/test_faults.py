@@ -81,22 +81,6 @@ def test_the_broad_phase_grows(device, memory):
     assert count > 5 and len(pairs) == 190
 
 
-def test_the_tree_of_the_broad_phase(device, monkeypatch):
-    """Warp allocates it past the allocator; a failure there spoils nothing either."""
-    scene = make_scene(device)
-
-    def fail(*args, **options):
-        raise RuntimeError("Failed to create BVH: out of memory")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(wp, "Bvh", fail)
-        for call in (scene.broad_phase, lambda: ab.Query(scene, "faces"), scene.intersect):
-            refused(RuntimeError, "BVH", call)
-    expected = make_scene(device).intersect(output="faces")
-    assert ab.Query(scene, "faces").run().count.sum() == expected.count.sum() > 0
-    assert describe(scene.intersect(output="faces")) == describe(expected)
-
-
 OPERATORS = {
     "faces": lambda scene: ab.Query(scene, "faces", pairs=MORE_PAIRS),
     "found": lambda scene: ab.Query(scene, "count", capacity=ab.Buffers(pairs=2)),

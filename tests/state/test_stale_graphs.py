@@ -125,7 +125,12 @@ def test_a_graph_keeps_its_arrays(device):
     replay, states, objects = captured(query), query.batch.states.pool, query.batch.objects.pool
     kept = [query.hits.face, query.hits.any_hit, query.pair_poses, query.pairs, query.traversal.work.counter]
     kept += [states.node_box, states.face_corner, states.lod, objects.state, objects.rotation]
-    kept += [query.broad_phase.lower, query.broad_phase.excluded, query.broad_phase.bvh, query.guard.launched]
+    kept += [
+        query.broad_phase.lower,
+        query.broad_phase.filter.excluded,
+        query.broad_phase.filter.group,
+        query.guard.launched,
+    ]
     alive = [weakref.ref(array) for array in kept]
     query.run()
     known, ids = objects.state, objects.state.numpy().tolist()

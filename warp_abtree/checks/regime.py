@@ -17,6 +17,8 @@ class Regime:
     # Pairs of nodes that a thread of the CPU compares by boxes alone before it looks whether few of them hit, and makes
     # slabs of subtrees where they do, which as many more tests have to pay for.
     plain_tests: int = 6144
+    # Pairs of tiles of objects from which on the broad phase of warps sorts these along a curve in each launch.
+    tile_tasks: int = 65536
     slabs: bool = True  # whether warps compare slabs of nodes of few faces, too, and distances slabs of all nodes
     # Fraction of its faces past which a state is refitted whole, as measured; slices repeat faces, k is smaller still.
     full_refit: dict = field(default_factory=lambda: {"cpu": 0.5, "cuda": 0.2})

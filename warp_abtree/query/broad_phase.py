@@ -8,18 +8,20 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.device_memory import DeviceMemory
-from warp_abtree.kernels.intersect.broad_phase import (
-    find_pair_kernel,
-    make_pair_key_kernel,
-    place_pair_kernel,
-    pose_box_kernel,
-)
+from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels.base.lanes import WARP_SIZE
+from warp_abtree.kernels.intersect import box_sweep, box_tiles
+from warp_abtree.kernels.intersect import broad_phase as kernels
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.request import CapacityError
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
 
 EVERY_WORLD = -1
+# Tasks of warps at most, of sorted objects, but for what their number needs.
+SORTED_TASKS = 2**20
+# Launches before the sort: boxes, their bounds, and keys.
+SORT_AFTER = 3
 
 
 class PosedBoxes:
@@ -42,10 +44,123 @@ class PosedBoxes:
         """Return the numbers that they depend on, by which launches are recorded anew."""
         return (self.wide,)
 
-    def make(self, launch, guard: LaunchGuard, lower, upper):
-        """Make the launch that writes lower and upper bounds of the boxes."""
-        inputs = [self._batch.trees, guard.record(), self.wide, self.reach, lower, upper]
-        return launch(pose_box_kernel, dim=len(lower), inputs=inputs, device=self._batch.device)
+    def make(self, launch, guard: LaunchGuard, boxes: kernels.PosedBounds):
+        """Make the launch that writes the boxes."""
+        inputs = [self._batch.trees, guard.record(), self.wide, self.reach, boxes]
+        return launch(kernels.pose_box_kernel, dim=len(boxes.lower), inputs=inputs, device=self._batch.device)
+
+
+def count_others(group: np.ndarray, tile: int, shared_group: int) -> np.ndarray:
+    """Return how many tiles each tile is compared with: those from itself to the end of its last group.
+
+    Args:
+        group: Group of each object in the order of tiles, rising.
+        tile: Objects of a tile.
+        shared_group: The group that pairs with all, -1 or the first.
+    """
+    first = np.arange(0, len(group), tile)
+    last = np.minimum(first + tile, len(group)) - 1
+    end = np.searchsorted(group, group[last], side="right")
+    end = np.where(group[first] == shared_group, len(group), end)
+    return -(-end // tile) - np.arange(len(first))
+
+
+def list_tasks(others: np.ndarray, most: int) -> np.ndarray:
+    """Return what warps compare, int32 (t, 3): a tile, the first of the others, and how many, so many at most."""
+    tasks = -(-others // most)
+    row = np.repeat(np.arange(len(others)), tasks)
+    skipped = most * (np.arange(tasks.sum()) - np.repeat(np.cumsum(tasks) - tasks, tasks))
+    return np.stack([row, row + skipped, np.minimum(most, others[row] - skipped)], 1).astype(np.int32)
+
+
+class TileSearch:
+    """Search for pairs by warps, in tiles of objects; of large groups along a curve.
+
+    Args:
+        broad_phase: `BroadPhase`.
+        group: Group of each object, NumPy int32 (n,).
+    """
+
+    def __init__(self, broad_phase: "BroadPhase", group: np.ndarray):
+        self._broad_phase, self.device, count = broad_phase, broad_phase.device, len(group)
+        self.tiles, self._lanes = box_tiles.Tiles(), WARP_SIZE if broad_phase.device.is_cuda else 1
+        order, most = np.argsort(group, kind="stable").astype(np.int32), 1
+        others = count_others(group[order], self._lanes, broad_phase.filter.shared_group)
+        self.sorts = others.sum() > current_regime().tile_tasks
+        self.tiles.order = wp.array(order, dtype=wp.int32, device=self.device)
+        if self.sorts:
+            # Few enough to be launched, many enough to share the work.
+            most = self._lanes * max(1, -(-int(others.sum()) // (self._lanes * SORTED_TASKS)))
+            self._key = wp.empty(2 * count, dtype=wp.int64, device=self.device)
+            self._ends = wp.empty(6, dtype=wp.float32, device=self.device)
+            self.tiles.order = wp.empty(2 * count, dtype=wp.int32, device=self.device)
+        self._tasks = wp.array(list_tasks(others, most), dtype=wp.vec3i, device=self.device)
+        self._key_bits = box_tiles.CURVE_BITS + int(group.max(initial=0)).bit_length()
+        self._tile_count = len(others)
+        boxed = self._tile_count if self.sorts else 0
+        self.tiles.lower = wp.empty(boxed, dtype=wp.vec3, device=self.device)
+        self.tiles.upper = wp.empty(boxed, dtype=wp.vec3, device=self.device)
+
+    def make(self, launch) -> list:
+        """Make the launches that find pairs of boxes."""
+        found, count, made = self._broad_phase, len(self._broad_phase.lower), []
+        warps = {"device": self.device, "block_dim": WARP_SIZE}
+        if self.sorts:
+            step = self._lanes * max(1, min(self._tile_count, 4 * self.device.sm_count if self.device.is_cuda else 1))
+            inputs = [self._ends, found.filter, found.bounds, self.tiles.order, self._key]
+            bound = [step, found.bounds, self._ends]
+            made.append(launch(box_tiles.bound_middle_kernel, dim=step, inputs=bound, **warps))
+            made.append(launch(box_tiles.make_curve_key_kernel, dim=count, inputs=inputs, device=self.device))
+            dim = self._lanes * self._tile_count
+            made.append(launch(box_tiles.bound_tile_kernel, dim=dim, inputs=[found.bounds, self.tiles], **warps))
+        pool = found.batch.objects.pool
+        inputs = [self._tasks, found.filter, self.tiles, pool, found.bounds, found.pairs]
+        dim = self._lanes * len(self._tasks)
+        return [*made, launch(box_tiles.find_tile_pair_kernel, dim=dim, inputs=inputs, **warps)]
+
+    def launch(self, launches: list):
+        """Launch what boxes the objects, and what `make` made, with a sort between them."""
+        if self.sorts:
+            self._ends.fill_(np.inf)
+        for launch in launches[:SORT_AFTER]:
+            launch()
+        if self.sorts:
+            self._sort()
+        for launch in launches[SORT_AFTER:]:
+            launch()
+
+    def _sort(self):
+        with wp.ScopedDevice(self.device):
+            wp.utils.radix_sort_pairs(self._key, self.tiles.order, len(self._key) // 2, end_bit=self._key_bits)
+
+
+class SweepSearch:
+    """Search for pairs by one thread of the CPU: sweep and prune in each group.
+
+    Args:
+        broad_phase, group: As for `TileSearch`.
+    """
+
+    def __init__(self, broad_phase: "BroadPhase", group: np.ndarray):
+        self._broad_phase, self.sweep, count = broad_phase, box_sweep.Sweep(), len(group)
+        starts = np.concatenate([[0], np.cumsum(np.bincount(group))])
+        self.sweep.start = wp.array(starts, dtype=wp.int32, device="cpu")
+        self.sweep.order = wp.array(np.argsort(group, kind="stable"), dtype=wp.int32, device="cpu")
+        self.sweep.place = wp.empty(count, dtype=wp.int32, device="cpu")
+        self.sweep.rows = wp.zeros(6 * (count + 16), dtype=wp.float32, device="cpu")
+        self.sweep.words = wp.empty(2 * count, dtype=wp.int64, device="cpu")
+
+    def make(self, launch) -> list:
+        """Make the launch that finds pairs of boxes."""
+        found = self._broad_phase
+        inputs = [found.filter, self.sweep, found.batch.objects.pool, found.bounds, found.pairs]
+        return [launch(box_sweep.sweep_pair_kernel, dim=1, inputs=inputs, device=found.device)]
+
+    @staticmethod
+    def launch(launches: list):
+        """Launch what boxes the objects, and what `make` made."""
+        for launch in launches:
+            launch()
 
 
 class BroadPhase(DeviceMemory):
@@ -62,8 +177,9 @@ class BroadPhase(DeviceMemory):
         pairs: (i, j), i < j, device vec2i (capacity,).
         key: i * 2^32 + j of each pair where they are sorted, device int64 (2 capacity,); the greatest int64 behind the
             last pair.
-        pair_count: Pairs found, device int32 (1,); keeps counting past the capacity.
         boxes: As given.
+        bounds: Boxes of the last launch, `kernels.intersect.broad_phase.PosedBounds`.
+        filter: Which objects may be a pair, `kernels.intersect.broad_phase.PairFilter`.
     """
 
     pairs: wp.array
@@ -76,21 +192,37 @@ class BroadPhase(DeviceMemory):
         check_device(device, "making a broad phase")
         count = batch.object_count
         worlds = batch.objects.pool.world.numpy()
+        # What is in every world comes first.
         names, group = np.unique(worlds, return_inverse=True)
-        everywhere = np.flatnonzero(names == EVERY_WORLD)
-        self.shared_group = int(everywhere[0]) if len(everywhere) else -1
-        self.lower = wp.zeros(count, dtype=wp.vec3, device=device)
-        self.upper = wp.zeros(count, dtype=wp.vec3, device=device)
-        self.group = wp.array(group.astype(np.int32), dtype=wp.int32, device=device)
-        self.excluded = wp.array(batch.excluded, dtype=wp.int64, device=device)
-        self.collision_bits = batch.objects.collision_bits
-        self.pair_count = wp.zeros(1, dtype=wp.int32, device=device)
+        group = group.astype(np.int32).reshape(-1)
+        self.filter, self.bounds = kernels.PairFilter(), kernels.PosedBounds()
+        self.filter.shared_group = 0 if len(names) and names[0] == EVERY_WORLD else -1
+        self.filter.group = wp.array(group, dtype=wp.int32, device=device)
+        self.filter.excluded = wp.array(batch.excluded, dtype=wp.int64, device=device)
+        self.filter.collision_bits = batch.objects.collision_bits
+        self.bounds.lower = wp.zeros(count, dtype=wp.vec3, device=device)
+        self.bounds.upper = wp.zeros(count, dtype=wp.vec3, device=device)
+        self.bounds.pair_count = wp.zeros(1, dtype=wp.int32, device=device)
         self.guard = guard or LaunchGuard(device, batch.states.generation, batch.filter_generation)
         self.resize(capacity or max(64, 4 * count))
         self._commands = Commands()
-        self.boxes.make(wp.launch, self.guard, self.lower, self.upper)
-        # Made here, since no graph can capture it.
-        self.bvh = wp.Bvh(self.lower, self.upper, groups=self.group)
+        self.search: TileSearch | SweepSearch
+        self.search = (TileSearch if current_regime().uses_warps(device) else SweepSearch)(self, group)
+
+    @property
+    def lower(self) -> wp.array:
+        """Return the lower ends of the boxes, device vec3 (n,)."""
+        return self.bounds.lower
+
+    @property
+    def upper(self) -> wp.array:
+        """Return the upper ends of the boxes, device vec3 (n,)."""
+        return self.bounds.upper
+
+    @property
+    def pair_count(self) -> wp.array:
+        """Return how many pairs were found, device int32 (1,); it keeps counting past the capacity."""
+        return self.bounds.pair_count
 
     def resize(self, capacity: int):
         """Make room for a number of pairs."""
@@ -106,34 +238,25 @@ class BroadPhase(DeviceMemory):
         return made
 
     def launch(self):
-        """Box, rebuild, query, and sort if asked. Launches only, so that a graph can capture it."""
+        """Box, search, and sort if asked. Launches only, so that a graph can capture it."""
         given = *self.guard.given(), self.pairs.ptr, self.boxes.given()
-        launch_boxes, launch_find = self._commands.find_callables("pairs", given, self.device, self._make_launches)
-        launch_boxes()
-        self.bvh.rebuild()
-        self.pair_count.zero_()
-        launch_find()
+        self.search.launch(self._commands.find_callables("pairs", given, self.device, self._make_launches))
         if self.sorts:
             self._sort()
 
     def _sort(self):
         room = len(self.pairs)
         inputs = [self.pair_count, self.pairs, self.order, self.key]
-        wp.launch(make_pair_key_kernel, room, inputs, device=self.device)
+        wp.launch(kernels.make_pair_key_kernel, room, inputs, device=self.device)
         with wp.ScopedDevice(self.device):
             # The key behind all others has only ones among these bits.
             wp.utils.radix_sort_pairs(self.key, self.order, room, end_bit=32 + len(self.lower).bit_length())
         inputs = [self.key, self.pair_count, self.pairs]
-        wp.launch(place_pair_kernel, room + 1, inputs, device=self.device)
+        wp.launch(kernels.place_pair_kernel, room + 1, inputs, device=self.device)
 
     def _make_launches(self, launch) -> list:
         """Return what boxes the objects, and what finds pairs."""
-        inputs = [
-            *(self.shared_group, self.bvh.id, self.lower, self.upper, self.group, self.excluded),
-            *(self.collision_bits, self.batch.objects.pool, self.pair_count, self.pairs),
-        ]
-        find = launch(find_pair_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
-        return [self.boxes.make(launch, self.guard, self.lower, self.upper), find]
+        return [self.boxes.make(launch, self.guard, self.bounds), *self.search.make(launch)]
 
     def count_found(self) -> int:
         """Return how many pairs the last launch found. Waits for the device.

@@ -67,7 +67,7 @@ class Pipeline(DeviceMemory):
     * 3 for LODs; 4 more where there are trees that no block of threads takes (on CUDA from 4,096 faces on, or as many
       times more as there are more states than multiprocessors; from 65,536 on always), and then 1 for each level on
       which their states together have more than 1,024 nodes; 1 with a ladder;
-    * 2 for the broad phase, with a clearing and a rebuild of `wp.Bvh` between them; none for given pairs;
+    * 2 for the broad phase, on CUDA 4 more and a sort where a world has many hundreds of objects; none for given pairs;
     * 2 for the narrow phase on the CPU (outside a graph one of them once a core), 4 on CUDA (3 without exact signs), 2
       more with `within`; for contacts those of `ContactQuery`;
     * 1 that keeps the greatest demand.

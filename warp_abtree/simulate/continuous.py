@@ -104,9 +104,9 @@ class CertifiedMotions(Operator):
         self._rounds, self._bodies = MotionRounds(bodies), bodies
         super().__init__(scene, [IntersectStage(), InsideStage(), self._rounds], None, capacity, sort_pairs=True)
         self._pool, self.goals = self.batch.objects.pool, self._rounds.goals
-        self._state, shared = self._rounds.state, self.broad_phase.shared_group
+        self._state, shared = self._rounds.state, self.broad_phase.filter.shared_group
         # What moves in every world holds all of them together.
-        world = self.broad_phase.group
+        world = self.broad_phase.filter.group
         moves = bodies.motion_type.numpy() != int(kernels.STATIC)
         self._state.world = wp.zeros_like(world) if (moves & (world.numpy() == shared)).any() else world
         self.fraction = self._state.fraction

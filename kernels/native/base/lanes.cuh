@@ -129,6 +129,14 @@ inline CUDA_CALLABLE wp::int32 next_place(wp::int32& end, bool flag) {
     return place;
 }
 
+inline CUDA_CALLABLE wp::uint32 vote_lanes(bool flag) {
+#if defined(__CUDA_ARCH__)
+    return __ballot_sync(0xffffffffu, flag);
+#else
+    return flag;
+#endif
+}
+
 inline CUDA_CALLABLE wp::int32 count_lanes(bool flag) {
 #if defined(__CUDA_ARCH__)
     return __popc(__ballot_sync(0xffffffffu, flag));

@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.upload import zeros_of
-from warp_abtree.kernels.intersect.broad_phase import pose_box_kernel
+from warp_abtree.kernels.intersect.broad_phase import PosedBounds, pose_box_kernel
 from warp_abtree.kernels.robot import answers, forward, link_pairs
 from warp_abtree.query.request import Buffers
 from warp_abtree.query.stages.distance import DistanceQuery
@@ -68,6 +68,9 @@ class LinkQuery(DeviceMemory):
         self.boxes, around = link_pairs.LinkBoxes(), request.around
         for name in ("lower", "upper"):
             setattr(self.boxes, name, wp.zeros(batch.object_count, dtype=wp.vec3, device=device))
+        self._bounds = PosedBounds()
+        self._bounds.lower, self._bounds.upper = self.boxes.lower, self.boxes.upper
+        self._bounds.pair_count = wp.zeros(1, dtype=wp.int32, device=device)
         self.bvh = wp.Bvh(self.boxes.lower[:around], self.boxes.upper[:around]) if around else None
         self.boxes.bvh = wp.uint64(0) if self.bvh is None else self.bvh.id
 
@@ -79,7 +82,7 @@ class LinkQuery(DeviceMemory):
         wp.launch(forward.forward_kernel, self.active, inputs, device=device)
         inputs = [around, parts, self.frames, self.batch.objects.pool]
         wp.launch(forward.place_part_kernel, (self.active, len(parts)), inputs, device=device)
-        inputs = [self.batch.trees, self.query.guard.record(), 0.0, None, self.boxes.lower, self.boxes.upper]
+        inputs = [self.batch.trees, self.query.guard.record(), 0.0, None, self._bounds]
         wp.launch(pose_box_kernel, around + self.active * len(parts), inputs, device=device)
         if self.bvh is not None:
             self.bvh.rebuild()

@@ -72,11 +72,11 @@ class SweptBoxes:
         """Return the numbers that they depend on."""
         return (self._stage.screw,)
 
-    def make(self, launch, guard, lower, upper):
-        """Make the launch that writes lower and upper bounds of the boxes."""
+    def make(self, launch, guard, boxes):
+        """Make the launch that writes the boxes."""
         stage, operator = self._stage, self._stage.operator
-        inputs = [stage.linear, stage.screw, operator.batch.trees, stage.ends, guard.record(), lower, upper]
-        return launch(start.sweep_box_kernel, dim=len(lower), inputs=inputs, device=operator.device)
+        inputs = [stage.linear, stage.screw, operator.batch.trees, stage.ends, guard.record(), boxes]
+        return launch(start.sweep_box_kernel, dim=len(boxes.lower), inputs=inputs, device=operator.device)
 
 
 class FirstContactStage(Stage):

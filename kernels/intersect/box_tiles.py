@@ -1,0 +1,177 @@
+"""Broad phase by warps: tiles of objects, each compared with those behind it.
+
+Objects are in the order of their groups, one a world. A tile is a warp of objects in this order; each task of a warp is
+a tile beside a few others from itself on. Where groups are large, their objects are sorted along a Morton curve in each
+launch, and boxes of tiles drop most of them. Source of the curve: Karras 2012, Thinking Parallel, part III.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.base.arrays import ObjectPool
+from warp_abtree.kernels.base.counters import reserve_slot
+from warp_abtree.kernels.base.lanes import (
+    hold_uniform,
+    lowest_bit,
+    vote_lanes,
+    warp_any,
+    warp_lane,
+    warp_min32,
+    warp_size,
+)
+from warp_abtree.kernels.intersect.broad_phase import PairFilter, PosedBounds, box_middle, may_pair, write_pair
+
+wp.set_module_options(native.options("base/counters.cuh", "base/lanes.cuh"))
+
+# Bits of a place on the Morton curve, and cells along an axis.
+CURVE_BITS = 30
+CURVE_CELLS = wp.constant(wp.float32(1023.0))
+
+
+@wp.struct
+class Tiles:
+    """Objects in the order of their groups, and boxes of each warp of them."""
+
+    order: wp.array(dtype=wp.int32)  # objects, shape [object], or more where it is sorted
+    lower: wp.array(dtype=wp.vec3)  # shape [tile]; [0] where tiles have no boxes
+    upper: wp.array(dtype=wp.vec3)  # shape [tile] or [0]
+
+
+@wp.func
+def bounds_meet(lower: wp.vec3, upper: wp.vec3, other_lower: wp.vec3, other_upper: wp.vec3):
+    """Return whether two closed boxes overlap."""
+    x = lower[0] <= other_upper[0] and other_lower[0] <= upper[0]
+    y = lower[1] <= other_upper[1] and other_lower[1] <= upper[1]
+    return x and y and lower[2] <= other_upper[2] and other_lower[2] <= upper[2]
+
+
+@wp.func
+def drop_lowest_bit(bits: wp.uint32):
+    return bits & (bits - wp.uint32(1))
+
+
+@wp.func
+def find_columns(
+    task_tile: wp.int32,
+    rows: wp.uint32,
+    tile: wp.int32,
+    filter: PairFilter,
+    tiles: Tiles,
+    objects: ObjectPool,
+    boxes: PosedBounds,
+    pairs: wp.array(dtype=wp.vec2i),
+):
+    """Find the pairs of some objects of a tile, a bit each, with those behind them in another, one a lane."""
+    size, count = warp_size(), boxes.lower.shape[0]
+    column = size * tile + warp_lane()
+    j = tiles.order[wp.min(column, count - 1)]
+    lower, upper, group = boxes.lower[j], boxes.upper[j], filter.group[j]
+    while rows != wp.uint32(0):
+        k = size * task_tile + lowest_bit(wp.int32(rows))
+        rows = drop_lowest_bit(rows)
+        i = tiles.order[k]
+        meets = column < count and column > k and bounds_meet(boxes.lower[i], boxes.upper[i], lower, upper)
+        if meets:
+            own = filter.group[i]
+            meets = group == own or group == filter.shared_group or own == filter.shared_group
+        if warp_any(meets):
+            if meets:
+                meets = may_pair(i, j, filter, objects)
+            write_pair(reserve_slot(boxes.pair_count, meets), i, j, pairs)
+
+
+@wp.kernel
+def find_tile_pair_kernel(
+    tasks: wp.array(dtype=wp.vec3i),
+    filter: PairFilter,
+    tiles: Tiles,
+    objects: ObjectPool,
+    boxes_inout: PosedBounds,
+    pairs_out: wp.array(dtype=wp.vec2i),
+):
+    """Find the pairs of a tile with so many others by a warp.
+
+    Args:
+        tasks: A tile, the first of the others, none before it, and how many these are.
+    """
+    task = tasks[wp.tid() / warp_size()]
+    if hold_uniform(boxes_inout.pair_count[0]) < 0:
+        return
+    lane, count, with_boxes = warp_lane(), boxes_inout.lower.shape[0], tiles.lower.shape[0] > 0
+    place = warp_size() * task[0] + lane
+    i = tiles.order[wp.min(place, count - 1)]
+    lower, upper = boxes_inout.lower[i], boxes_inout.upper[i]
+    first = wp.int32(0)
+    while first < task[2]:
+        near = first + lane < task[2]
+        if near and with_boxes:
+            other = task[1] + first + lane
+            near = bounds_meet(tiles.lower[task[0]], tiles.upper[task[0]], tiles.lower[other], tiles.upper[other])
+        others = vote_lanes(near)
+        while others != wp.uint32(0):
+            tile = task[1] + first + lowest_bit(wp.int32(others))
+            others = drop_lowest_bit(others)
+            is_row = place < count
+            if is_row and with_boxes:
+                is_row = bounds_meet(lower, upper, tiles.lower[tile], tiles.upper[tile])
+            find_columns(task[0], vote_lanes(is_row), tile, filter, tiles, objects, boxes_inout, pairs_out)
+        first += warp_size()
+
+
+@wp.kernel
+def bound_middle_kernel(step: wp.int32, boxes: PosedBounds, ends_inout: wp.array(dtype=wp.float32)):
+    """Bound the middles of all boxes, in a grid-stride loop: the least of each axis, and of the other way."""
+    i = wp.tid()
+    least, most = box_middle(boxes, 0), -box_middle(boxes, 0)
+    while i < boxes.lower.shape[0]:
+        middle = box_middle(boxes, i)
+        least = wp.min(least, middle)
+        most = wp.min(most, -middle)
+        i += step
+    for k in range(3):
+        low, high = warp_min32(least[k]), warp_min32(most[k])
+        if warp_lane() == 0:
+            wp.atomic_min(ends_inout, k, low)
+            wp.atomic_min(ends_inout, 3 + k, high)
+
+
+@wp.func
+def spread_bits(x: wp.int32):
+    """Return ten bits with two zeros in front of each."""
+    x = (x | (x << 16)) & 0x030000FF
+    x = (x | (x << 8)) & 0x0300F00F
+    x = (x | (x << 4)) & 0x030C30C3
+    return (x | (x << 2)) & 0x09249249
+
+
+@wp.kernel
+def make_curve_key_kernel(
+    ends: wp.array(dtype=wp.float32),
+    filter: PairFilter,
+    boxes: PosedBounds,
+    order_out: wp.array(dtype=wp.int32),
+    key_out: wp.array(dtype=wp.int64),
+):
+    """Make the key of each object: its group, and where its middle lies on a Morton curve."""
+    i = wp.tid()
+    middle, code = box_middle(boxes, i), wp.int32(0)
+    for k in range(3):
+        low = ends[k]
+        width = wp.max(-ends[3 + k] - low, wp.float32(1.0e-30))
+        cell = wp.int32(wp.clamp((middle[k] - low) / width, wp.float32(0.0), wp.float32(1.0)) * CURVE_CELLS)
+        code = code | (spread_bits(cell) << k)
+    order_out[i] = i
+    key_out[i] = (wp.int64(filter.group[i]) << wp.int64(wp.static(CURVE_BITS))) | wp.int64(code)
+
+
+@wp.kernel
+def bound_tile_kernel(boxes: PosedBounds, tiles_inout: Tiles):
+    """Box the objects of one tile a warp."""
+    tile = wp.tid() / warp_size()
+    i = tiles_inout.order[wp.min(wp.tid(), boxes.lower.shape[0] - 1)]
+    lower, upper = boxes.lower[i], -boxes.upper[i]
+    least = wp.vec3(warp_min32(lower[0]), warp_min32(lower[1]), warp_min32(lower[2]))
+    most = wp.vec3(warp_min32(upper[0]), warp_min32(upper[1]), warp_min32(upper[2]))
+    if warp_lane() == 0:
+        tiles_inout.lower[tile] = least
+        tiles_inout.upper[tile] = -most
