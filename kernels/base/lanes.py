@@ -32,6 +32,14 @@ def next_place(end: wp.ref[wp.int32], flag: bool) -> wp.int32:
 
 
 @native.func_native()
+def value_of_lane(x: wp.int32, lane: wp.int32) -> wp.int32: ...
+
+
+@native.func_native()
+def vector_of_lane(x: wp.vec3, lane: wp.int32) -> wp.vec3: ...
+
+
+@native.func_native()
 def vote_lanes(flag: bool) -> wp.uint32:
     """Return a word with the bit of each lane that has set its flag."""
 

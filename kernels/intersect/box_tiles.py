@@ -13,6 +13,8 @@ from warp_abtree.kernels.base.counters import reserve_slot
 from warp_abtree.kernels.base.lanes import (
     hold_uniform,
     lowest_bit,
+    value_of_lane,
+    vector_of_lane,
     vote_lanes,
     warp_any,
     warp_lane,
@@ -50,9 +52,32 @@ def drop_lowest_bit(bits: wp.uint32):
     return bits & (bits - wp.uint32(1))
 
 
+@wp.struct
+class TileObject:
+    """Object of a tile that a lane has."""
+
+    place: wp.int32  # in the order, perhaps behind the last
+    object: wp.int32  # the last one behind it
+    group: wp.int32  # its group
+    lower: wp.vec3  # lower ends of its box
+    upper: wp.vec3  # upper ends
+
+
+@wp.func
+def load_tile_object(tile: wp.int32, filter: PairFilter, tiles: Tiles, boxes: PosedBounds):
+    """Return the object of a tile that this lane has."""
+    own = TileObject()
+    own.place = warp_size() * tile + warp_lane()
+    own.object = tiles.order[wp.min(own.place, boxes.lower.shape[0] - 1)]
+    own.group = filter.group[own.object]
+    own.lower = boxes.lower[own.object]
+    own.upper = boxes.upper[own.object]
+    return own
+
+
 @wp.func
 def find_columns(
-    task_tile: wp.int32,
+    own: TileObject,
     rows: wp.uint32,
     tile: wp.int32,
     filter: PairFilter,
@@ -62,22 +87,23 @@ def find_columns(
     pairs: wp.array(dtype=wp.vec2i),
 ):
     """Find the pairs of some objects of a tile, a bit each, with those behind them in another, one a lane."""
-    size, count = warp_size(), boxes.lower.shape[0]
-    column = size * tile + warp_lane()
-    j = tiles.order[wp.min(column, count - 1)]
-    lower, upper, group = boxes.lower[j], boxes.upper[j], filter.group[j]
+    column = load_tile_object(tile, filter, tiles, boxes)
+    is_column = column.place < boxes.lower.shape[0]
     while rows != wp.uint32(0):
-        k = size * task_tile + lowest_bit(wp.int32(rows))
+        k = lowest_bit(wp.int32(rows))
         rows = drop_lowest_bit(rows)
-        i = tiles.order[k]
-        meets = column < count and column > k and bounds_meet(boxes.lower[i], boxes.upper[i], lower, upper)
-        if meets:
-            own = filter.group[i]
-            meets = group == own or group == filter.shared_group or own == filter.shared_group
+        lower, upper = vector_of_lane(own.lower, k), vector_of_lane(own.upper, k)
+        group, i = value_of_lane(own.group, k), value_of_lane(own.object, k)
+        meets = is_column and column.place > value_of_lane(own.place, k)
+        meets = meets and bounds_meet(lower, upper, column.lower, column.upper)
+        shared = group == filter.shared_group or column.group == filter.shared_group
+        meets = meets and (group == column.group or shared)
         if warp_any(meets):
             if meets:
-                meets = may_pair(i, j, filter, objects)
-            write_pair(reserve_slot(boxes.pair_count, meets), i, j, pairs)
+                meets = may_pair(i, column.object, filter, objects)
+            slot = reserve_slot(boxes.pair_count, meets)
+            if meets:
+                write_pair(slot, i, column.object, pairs)
 
 
 @wp.kernel
@@ -97,10 +123,8 @@ def find_tile_pair_kernel(
     task = tasks[wp.tid() / warp_size()]
     if hold_uniform(boxes_inout.pair_count[0]) < 0:
         return
-    lane, count, with_boxes = warp_lane(), boxes_inout.lower.shape[0], tiles.lower.shape[0] > 0
-    place = warp_size() * task[0] + lane
-    i = tiles.order[wp.min(place, count - 1)]
-    lower, upper = boxes_inout.lower[i], boxes_inout.upper[i]
+    lane, with_boxes = warp_lane(), tiles.lower.shape[0] > 0
+    own = load_tile_object(task[0], filter, tiles, boxes_inout)
     first = wp.int32(0)
     while first < task[2]:
         near = first + lane < task[2]
@@ -111,10 +135,10 @@ def find_tile_pair_kernel(
         while others != wp.uint32(0):
             tile = task[1] + first + lowest_bit(wp.int32(others))
             others = drop_lowest_bit(others)
-            is_row = place < count
+            is_row = own.place < boxes_inout.lower.shape[0]
             if is_row and with_boxes:
-                is_row = bounds_meet(lower, upper, tiles.lower[tile], tiles.upper[tile])
-            find_columns(task[0], vote_lanes(is_row), tile, filter, tiles, objects, boxes_inout, pairs_out)
+                is_row = bounds_meet(own.lower, own.upper, tiles.lower[tile], tiles.upper[tile])
+            find_columns(own, vote_lanes(is_row), tile, filter, tiles, objects, boxes_inout, pairs_out)
         first += warp_size()
 
 
