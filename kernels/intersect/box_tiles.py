@@ -93,8 +93,9 @@ def find_columns(
         k = lowest_bit(wp.int32(rows))
         rows = drop_lowest_bit(rows)
         lower, upper = vector_of_lane(own.lower, k), vector_of_lane(own.upper, k)
-        group, i = value_of_lane(own.group, k), value_of_lane(own.object, k)
-        meets = is_column and column.place > value_of_lane(own.place, k)
+        # Before any condition, since all lanes take part.
+        group, i, place = value_of_lane(own.group, k), value_of_lane(own.object, k), value_of_lane(own.place, k)
+        meets = is_column and column.place > place
         meets = meets and bounds_meet(lower, upper, column.lower, column.upper)
         shared = group == filter.shared_group or column.group == filter.shared_group
         meets = meets and (group == column.group or shared)
