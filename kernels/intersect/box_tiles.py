@@ -11,6 +11,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.counters import reserve_slot
 from warp_abtree.kernels.base.lanes import (
+    WARP_SIZE,
     hold_uniform,
     lowest_bit,
     value_of_lane,
@@ -23,7 +24,7 @@ from warp_abtree.kernels.base.lanes import (
 )
 from warp_abtree.kernels.intersect.broad_phase import PairFilter, PosedBounds, box_middle, may_pair, write_pair
 
-wp.set_module_options(native.options("base/counters.cuh", "base/lanes.cuh"))
+wp.set_module_options(native.options("base/counters.cuh", "base/lanes.cuh") | {"block_dim": WARP_SIZE})
 
 # Bits of a place on the Morton curve, and cells along an axis.
 CURVE_BITS = 30

@@ -24,6 +24,13 @@ SORTED_TASKS = 2**20
 SORT_AFTER = 3
 
 
+def broad_phase_kernels(device) -> list:
+    """Return the kernels of a broad phase, as `loading` takes them."""
+    by_warps = current_regime().uses_warps(device)
+    finding = (box_tiles.find_tile_pair_kernel, WARP_SIZE) if by_warps else (box_sweep.sweep_pair_kernel, 256)
+    return [finding, (kernels.pose_box_kernel, 256)]
+
+
 class PosedBoxes:
     """Boxes of objects where they stand, for a `BroadPhase`.
 
@@ -110,7 +117,7 @@ class TileSearch:
             inputs = [self._ends, found.filter, found.bounds, self.tiles.order, self._key]
             bound = [step, found.bounds, self._ends]
             made.append(launch(box_tiles.bound_middle_kernel, dim=step, inputs=bound, **warps))
-            made.append(launch(box_tiles.make_curve_key_kernel, dim=count, inputs=inputs, device=self.device))
+            made.append(launch(box_tiles.make_curve_key_kernel, dim=count, inputs=inputs, **warps))
             dim = self._lanes * self._tile_count
             made.append(launch(box_tiles.bound_tile_kernel, dim=dim, inputs=[found.bounds, self.tiles], **warps))
         pool = found.batch.objects.pool

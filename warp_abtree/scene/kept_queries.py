@@ -9,8 +9,8 @@ import warp as wp
 from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.checks.kernel_loading import loading, of_first_query
 from warp_abtree.kernels.base.nodes import clear_node_kernel
-from warp_abtree.kernels.intersect.broad_phase import pose_box_kernel
 from warp_abtree.kernels.io.place_poses import pose_setter
+from warp_abtree.query.broad_phase import broad_phase_kernels
 from warp_abtree.query.operator import Operator, operator_kernels
 from warp_abtree.query.request import SCENE_OPTIONS, check_options, check_within, refuse_signed
 from warp_abtree.query.result import Result
@@ -24,9 +24,8 @@ from warp_abtree.state.work_lists import update_kernels
 
 def scene_kernels(device, face_counts, with_broad_phase: bool) -> list:
     """Return the kernels that make tree states, poses and object pairs of a scene, with block sizes; see `loading`."""
-    kernels = [pose_box_kernel] if with_broad_phase else []
-    kernels += [clear_node_kernel, pose_setter(wp.float64, 7)]
-    return [*update_kernels(face_counts, device), *[(kernel, 256) for kernel in kernels]]
+    found = broad_phase_kernels(device) if with_broad_phase else []
+    return [*update_kernels(face_counts, device), *found, (clear_node_kernel, 256), (pose_setter(wp.float64, 7), 256)]
 
 
 @of_first_query
