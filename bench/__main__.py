@@ -23,7 +23,9 @@ import warp_abtree as ab
 
 from . import tables
 
-NAMES = "assembly baselines budget build coarse distance exact frame gate host motion points query robot scale sweep"
+NAMES = (
+    "assembly baselines broad budget build coarse distance exact frame gate host motion points query robot scale sweep"
+)
 CASES = (*NAMES.split(), "update")
 STUDIES = {"paper": "study", "tradeoff": "study", "nightly": "nightly"}  # and the modules that run them
 MODULES = {name: f"bench.cases.{name}" for name in CASES} | {"motion": "bench.motions.case"}
