@@ -5,7 +5,6 @@ import trimesh
 import warp as wp
 
 import warp_abtree as ab
-from warp_abtree.query.broad_phase import BroadPhase
 
 from ..shapes import random_directions
 from ..timing import make_runs, ratio_of, summarise, time_rounds
@@ -63,15 +62,16 @@ def run(device, quick=False):
         scene.add_many(
             box, np.concatenate([places, random_directions(rng, count, 4)], 1), np.repeat(range(worlds), each)
         )
-        ours = BroadPhase(scene.batch())
-        pairs = ours.find()
-        peer = TreeBaseline(ours)
-        peer.launch()
-        theirs = peer.pairs.numpy()[: int(peer.count.numpy()[0])].reshape(-1, 2)
+        pairs = scene.broad_phase()
+        ours = ab.Query(scene, "any", capacity=ab.Buffers(pairs=len(pairs))).broad_phase
+        ours.launch()
+        tree = TreeBaseline(ours)
+        tree.launch()
+        theirs = tree.pairs.numpy()[: int(tree.count.numpy()[0])].reshape(-1, 2)
         if not np.array_equal(theirs[np.lexsort(theirs.T[::-1])], pairs):
             raise RuntimeError("the tree finds other pairs")
         times = time_rounds(
-            make_runs({"ours": ours.launch, "peer": peer.launch}, device), REPEATS["cuda" if device.is_cuda else "cpu"]
+            make_runs({"ours": ours.launch, "peer": tree.launch}, device), REPEATS["cuda" if device.is_cuda else "cpu"]
         )
         row = {"device": device.name, "objects": count, "worlds": worlds, "pairs": len(pairs)}
         yield row | summarise(times) | {"ratio": ratio_of(times["peer"], times["ours"])}
