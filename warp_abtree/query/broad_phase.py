@@ -200,8 +200,8 @@ class BroadPhase(DeviceMemory):
         count = batch.object_count
         worlds = batch.objects.pool.world.numpy()
         # What is in every world comes first.
-        names, group = np.unique(worlds, return_inverse=True)
-        group = group.astype(np.int32).reshape(-1)
+        names, inverse = np.unique(worlds, return_inverse=True)
+        group: np.ndarray = inverse.astype(np.int32).reshape(-1)
         self.filter, self.bounds = kernels.PairFilter(), kernels.PosedBounds()
         self.filter.shared_group = 0 if len(names) and names[0] == EVERY_WORLD else -1
         self.filter.group = wp.array(group, dtype=wp.int32, device=device)
