@@ -74,6 +74,12 @@ def check_frame(rows):
     assert [row["ladder"] for row in rows] == [False, True] and rows[0]["hits"] == rows[1]["hits"] > 0
 
 
+def check_broad(rows):
+    assert [(row["objects"], row["worlds"]) for row in rows] == [(16, 1), (64, 16)]
+    for row in rows:
+        assert row["pairs"] > 0 and row["ratio"] == pytest.approx(row["peer_ms"] / row["ours_ms"], rel=0.05)
+
+
 def check_host(rows):
     assert [(row["pairs"], row["output"]) for row in rows] == [
         (count, name) for count in (1, 4) for name in host.OUTPUTS
