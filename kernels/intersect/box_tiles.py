@@ -183,6 +183,7 @@ def make_curve_key_kernel(
     middle, code = box_middle(boxes, i), wp.int32(0)
     for k in range(3):
         low = ends[k]
+        # Of no width: an order alone, on which no pair depends.
         width = wp.max(-ends[3 + k] - low, wp.float32(1.0e-30))
         cell = wp.int32(wp.clamp((middle[k] - low) / width, wp.float32(0.0), wp.float32(1.0)) * CURVE_CELLS)
         code = code | (spread_bits(cell) << k)

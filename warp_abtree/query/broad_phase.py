@@ -94,8 +94,9 @@ class TileSearch:
         order, most = np.argsort(group, kind="stable").astype(np.int32), 1
         others = count_others(group[order], self._lanes, broad_phase.filter.shared_group)
         self.sorts = others.sum() > current_regime().tile_tasks
-        self.tiles.order = wp.array(order, dtype=wp.int32, device=self.device)
-        if self.sorts:
+        if not self.sorts:
+            self.tiles.order = wp.array(order, dtype=wp.int32, device=self.device)
+        else:
             # Few enough to be launched, many enough to share the work.
             most = self._lanes * max(1, -(-int(others.sum()) // (self._lanes * SORTED_TASKS)))
             self._key = wp.empty(2 * count, dtype=wp.int64, device=self.device)

@@ -2,6 +2,7 @@
 #pragma once
 #include "builtin.h"
 #include "base/float32.h"
+#include "base/radix.h"
 
 struct SweptRows {
     typedef unsigned long long word;
@@ -24,16 +25,7 @@ struct SweptRows {
             return from;
         }
         for (int shift = 32; shift < 64; shift += 8) {
-            unsigned int place[256] = {};
-            for (int i = 0; i < count; ++i)
-                ++place[from[i] >> shift & 255];
-            for (unsigned int digit = 0, sum = 0; digit < 256; ++digit) {
-                const unsigned int own = place[digit];
-                place[digit] = sum;
-                sum += own;
-            }
-            for (int i = 0; i < count; ++i)
-                to[place[from[i] >> shift & 255]++] = from[i];
+            sort_digit(from, to, count, shift);
             word* const last = from;
             from = to;
             to = last;

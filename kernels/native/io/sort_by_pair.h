@@ -1,6 +1,7 @@
 // Hits in order on the CPU: by object pair in one pass, then each pair's faces by their digits, in the caches.
 #pragma once
 #include "builtin.h"
+#include "base/radix.h"
 
 inline void sort_by_pair(wp::int32 count, wp::int32 pair_mask, wp::int32 flag,
                          wp::array_t<wp::vec_t<3, wp::int32>> face, wp::array_t<wp::int64> key,
@@ -34,16 +35,7 @@ inline void sort_by_pair(wp::int32 count, wp::int32 pair_mask, wp::int32 flag,
         for (int shift = 0; shift < 64; shift += 8) {
             if ((varied >> shift & 255) == 0)
                 continue;
-            unsigned int place[256] = {};
-            for (int i = 0; i < length; ++i)
-                ++place[from[i] >> shift & 255];
-            for (unsigned int digit = 0, sum = 0; digit < 256; ++digit) {
-                const unsigned int own = place[digit];
-                place[digit] = sum;
-                sum += own;
-            }
-            for (int i = 0; i < length; ++i)
-                to[place[from[i] >> shift & 255]++] = from[i];
+            sort_digit(from, to, length, shift);
             word* last = from;
             from = to;
             to = last;
