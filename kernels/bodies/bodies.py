@@ -16,6 +16,11 @@ KINEMATIC = wp.constant(1)
 DYNAMIC = wp.constant(2)
 """Motion type of an object: it stands, its motion is prescribed, or it is a rigid body."""
 
+ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
+
+FREE, STUCK, ON_TRIAL, STUCK_AGAIN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
+"""Whether a body's last motion was cut to next to nothing, and what came of it; the odd ones move out of contact."""
+
 LOOKAHEAD_LEAST, LOOKAHEAD_MAX = wp.constant(wp.float64(2.0**-8)), wp.constant(wp.float64(0.25))
 """How far ahead of a body contacts are looked for, beside its motion in a step, and motion at most, in its radii."""
 
@@ -36,11 +41,15 @@ class Bodies:
     velocity: wp.array(dtype=wp.vec3d)  # of the centre of mass [world units/s]
     momentum: wp.array(dtype=wp.vec3d)  # angular momentum, world frame; of kinematic objects angular velocity [rad/s]
     reach: wp.array(dtype=wp.vec4d)  # motion in a step, and reach beside it, for contacts ahead [world units]
+    stuck: wp.array(dtype=wp.int32)  # FREE, STUCK, ON_TRIAL or STUCK_AGAIN
     # of one step
     inverse_inertia: wp.array(dtype=wp.mat33d)  # world frame; of kinematic objects the identity
-    pseudo_velocity: wp.array(dtype=wp.vec3d)  # of the position correction [world units/s]
-    pseudo_momentum: wp.array(dtype=wp.vec3d)  # its angular momentum
+    moved: wp.array(dtype=wp.vec3d)  # by how much the centre has moved [world units]
+    turned: wp.array(dtype=wp.vec3d)  # rotation so far, sum of axis times angle [rad]
+    impulse: wp.array(dtype=wp.vec3d)  # sum of the impulses that the next substep begins with
+    moment: wp.array(dtype=wp.vec3d)  # sum of their moments about the centre of mass
     bid: wp.array(dtype=wp.int64)  # highest bid of the graph coloring
+    colors: wp.array(dtype=wp.int32)  # bit mask of the colors that its pairs have
     is_whole: wp.array(dtype=wp.int32)  # entry 0: whether all contacts are known, 0 or 1; else bodies keep their state
 
 
@@ -77,24 +86,20 @@ def judge_contacts_kernel(batch: PairBatch, hits: Hits, bodies_out: Bodies):
 
 
 @wp.kernel
-def begin_step_kernel(
-    dt: wp.float64,
-    velocity_change: wp.vec3d,
-    targets: ObjectPool,
-    objects: ObjectPool,
-    bodies_inout: Bodies,
-):
-    """Initialise a step: gravity changes velocities; kinematic objects get those that take them to their targets."""
+def begin_step_kernel(dt: wp.float64, targets: ObjectPool, objects: ObjectPool, bodies_inout: Bodies):
+    """Initialise a step: kinematic objects get velocities that take them to their targets."""
     i = wp.tid()
     if bodies_inout.is_whole[0] == 0:
         return
-    bodies_inout.pseudo_velocity[i] = wp.vec3d()
-    bodies_inout.pseudo_momentum[i] = wp.vec3d()
+    bodies_inout.moved[i] = wp.vec3d()
+    bodies_inout.turned[i] = wp.vec3d()
+    bodies_inout.impulse[i] = wp.vec3d()
+    bodies_inout.moment[i] = wp.vec3d()
     bodies_inout.bid[i] = wp.int64(0)
+    bodies_inout.colors[i] = 0
     if bodies_inout.motion_type[i] == DYNAMIC:
         r = wp.quat_to_matrix(bodies_inout.rotation[i])
         bodies_inout.inverse_inertia[i] = r * wp.diag(bodies_inout.inverse_moment[i]) * wp.transpose(r)
-        bodies_inout.velocity[i] += velocity_change
         return
     bodies_inout.position[i] = objects.position[i]
     if bodies_inout.motion_type[i] == KINEMATIC:
@@ -105,27 +110,49 @@ def begin_step_kernel(
         bodies_inout.inverse_inertia[i] = wp.identity(n=3, dtype=wp.float64)
 
 
+@wp.kernel
+def begin_substep_kernel(velocity_change: wp.vec3d, bodies_inout: Bodies):
+    """Change the velocities of a body by gravity, and by the impulses that the substep begins with."""
+    i = wp.tid()
+    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] != DYNAMIC:
+        return
+    bodies_inout.velocity[i] += velocity_change + bodies_inout.inverse_mass[i] * bodies_inout.impulse[i]
+    bodies_inout.momentum[i] += bodies_inout.moment[i]
+    bodies_inout.impulse[i] = wp.vec3d()
+    bodies_inout.moment[i] = wp.vec3d()
+
+
+@wp.kernel
+def move_bodies_kernel(h: wp.float64, bodies_inout: Bodies):
+    """Move an object by its velocity for the time of a substep, unless it is stuck."""
+    i = wp.tid()
+    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] == STATIC or (bodies_inout.stuck[i] & 1) != 0:
+        return
+    momentum = bodies_inout.momentum[i]
+    bodies_inout.moved[i] += h * bodies_inout.velocity[i]
+    bodies_inout.turned[i] += h * (bodies_inout.inverse_inertia[i] * momentum)
+    if bodies_inout.motion_type[i] == DYNAMIC:
+        q = bodies_inout.rotation[i]
+        bodies_inout.position[i] += h * bodies_inout.velocity[i]
+        bodies_inout.rotation[i] = integrate_rotation(q, momentum, bodies_inout.inverse_moment[i], h)
+
+
 @wp.func
 def reach_of(bodies: Bodies, i: wp.int32, dt: wp.float64):
     """Return the motion of an object's centre in a step, and a bound on its surface's motion relative to that."""
     motion = dt * bodies.velocity[i]
     if bodies.motion_type[i] != DYNAMIC:
-        return wp.vec4d(motion[0], motion[1], motion[2], wp.float64(0.0))
+        return wp.vec4d(motion[0], motion[1], motion[2], ZERO)
     radius = bodies.bounding_radius[i]
     most = LOOKAHEAD_MAX * radius
-    motion = motion * wp.min(most / wp.max(wp.length(motion), most), wp.float64(1.0))
+    motion = motion * wp.min(most / wp.max(wp.length(motion), most), ONE)
     turn = dt * wp.length(bodies.inverse_inertia[i] * bodies.momentum[i]) * radius
     return wp.vec4d(motion[0], motion[1], motion[2], wp.min(turn, most) + LOOKAHEAD_LEAST * radius)
 
 
 @wp.kernel
-def integrate_kernel(
-    dt: wp.float64,
-    targets: ObjectPool,
-    bodies_inout: Bodies,
-    objects_inout: ObjectPool,
-):
-    """Move each body by its velocity and its position correction, and pose its object."""
+def pose_objects_kernel(dt: wp.float64, targets: ObjectPool, bodies_inout: Bodies, objects_inout: ObjectPool):
+    """End a step: pose each body's object, or its goal."""
     i = wp.tid()
     if bodies_inout.is_whole[0] == 0:
         return
@@ -135,13 +162,6 @@ def integrate_kernel(
         objects_inout.position[i] = targets.position[i]
     if bodies_inout.motion_type[i] != DYNAMIC:
         return
-    bodies_inout.position[i] += dt * (bodies_inout.velocity[i] + bodies_inout.pseudo_velocity[i])
-    q = integrate_rotation(bodies_inout.rotation[i], bodies_inout.momentum[i], bodies_inout.inverse_moment[i], dt)
-    correction = rotation_by(dt * (bodies_inout.inverse_inertia[i] * bodies_inout.pseudo_momentum[i]))
-    q = wp.normalize(correction * q)
-    # The momentum rotates along, otherwise the kinetic energy would change.
-    bodies_inout.momentum[i] = wp.quat_rotate(correction, bodies_inout.momentum[i])
-    bodies_inout.rotation[i] = q
-    rotation = wp.quat_to_matrix(q) * wp.transpose(bodies_inout.axes[i])
+    rotation = wp.quat_to_matrix(bodies_inout.rotation[i]) * wp.transpose(bodies_inout.axes[i])
     objects_inout.rotation[i] = rotation
     objects_inout.position[i] = bodies_inout.position[i] - rotation * bodies_inout.centre[i]

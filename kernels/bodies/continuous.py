@@ -13,7 +13,18 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.poses import PairBatch
-from warp_abtree.kernels.bodies.bodies import DYNAMIC, STATIC, Bodies, rotation_by
+from warp_abtree.kernels.bodies.bodies import (
+    DYNAMIC,
+    FREE,
+    ON_TRIAL,
+    ONE,
+    STATIC,
+    STUCK,
+    STUCK_AGAIN,
+    ZERO,
+    Bodies,
+    rotation_by,
+)
 from warp_abtree.kernels.bodies.constraints import SLOP
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, UNDECIDED
@@ -31,12 +42,7 @@ CUT, MATCH, HOLD_BOTH, CERTIFY = wp.constant(0), wp.constant(1), wp.constant(2),
 smaller, cut both at the start, or hold the world."""
 
 NEAR, VERY_NEAR = wp.constant(wp.float64(0.25)), wp.constant(wp.float64(1.0 / 32.0))
-FREE, STUCK, ON_TRIAL, STUCK_AGAIN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
-"""Whether a body's last motion was cut to next to nothing, and what came of it; the odd ones move out of contact."""
-
 EXEMPT, LAST_LEVEL = wp.constant(-1), wp.constant(2)
-
-ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 
 
 @wp.struct
@@ -47,9 +53,10 @@ class StepMotions:
     goals: ObjectPool  # poses that the step aims for: rotation and position
     ends: ObjectPool  # poses that it ends at
     fraction: wp.array(dtype=wp.float64)  # of its motion that an object makes, 0 to 1, shape [object]
-    stuck: wp.array(dtype=wp.int32)  # FREE, STUCK, ON_TRIAL or STUCK_AGAIN, shape [object]
     cut: wp.array(dtype=wp.float64)  # fraction of its way that the round leaves, shape [object]
     is_changed: wp.array(dtype=wp.int32)  # whether the last round has cut its way, 0 or 1, shape [object]
+    solved: wp.array(dtype=wp.vec3d)  # velocity that also takes a stuck body out of contact, shape [object]
+    solved_momentum: wp.array(dtype=wp.vec3d)  # its angular momentum
     is_held: wp.array(dtype=wp.int32)  # of each world, 0 or 1, shape [object]
     level: wp.array(dtype=wp.int32)  # of a pair's margin, 0 to LAST_LEVEL; EXEMPT where not searched, shape [pair]
     is_again: wp.array(dtype=wp.int32)  # whether a pair is searched again at another level, 0 or 1, shape [pair]
@@ -57,20 +64,25 @@ class StepMotions:
 
 
 @wp.kernel
-def free_stuck_kernel(dt: wp.float64, objects: ObjectPool, bodies_inout: Bodies, motions_inout: StepMotions):
-    """Let a body that was stuck in the last step move by its position correction alone, out of contact."""
+def keep_solved_kernel(bodies: Bodies, motions_inout: StepMotions):
+    """Keep the velocities of a stuck body, solved and not relaxed yet."""
     i = wp.tid()
-    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] != DYNAMIC or (motions_inout.stuck[i] & 1) == 0:
+    motions_inout.solved[i] = bodies.velocity[i]
+    motions_inout.solved_momentum[i] = bodies.momentum[i]
+
+
+@wp.kernel
+def free_stuck_kernel(h: wp.float64, motions: StepMotions, bodies_inout: Bodies):
+    """Move a stuck body for a substep by its position correction alone: by what relaxation took from its velocity."""
+    i = wp.tid()
+    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] != DYNAMIC or (bodies_inout.stuck[i] & 1) == 0:
         return
-    axes, centre = bodies_inout.axes[i], bodies_inout.centre[i]
-    turn = rotation_by(dt * (bodies_inout.inverse_inertia[i] * bodies_inout.pseudo_momentum[i]))
-    q = wp.normalize(turn * wp.quat_from_matrix(objects.rotation[i] * axes))
-    position = objects.position[i] + objects.rotation[i] * centre + dt * bodies_inout.pseudo_velocity[i]
-    bodies_inout.rotation[i] = q
-    bodies_inout.position[i] = position
-    rotation = wp.quat_to_matrix(q) * wp.transpose(axes)
-    motions_inout.goals.rotation[i] = rotation
-    motions_inout.goals.position[i] = position - rotation * centre
+    step = h * (motions.solved[i] - bodies_inout.velocity[i])
+    turn = h * (bodies_inout.inverse_inertia[i] * (motions.solved_momentum[i] - bodies_inout.momentum[i]))
+    bodies_inout.position[i] += step
+    bodies_inout.moved[i] += step
+    bodies_inout.rotation[i] = wp.normalize(rotation_by(turn) * bodies_inout.rotation[i])
+    bodies_inout.turned[i] += turn
 
 
 @wp.kernel
@@ -271,12 +283,12 @@ def end_way_kernel(
         objects_inout.rotation[i] = motions.ends.rotation[i]
         objects_inout.position[i] = motions.ends.position[i]
     motions.fraction[i] = fraction
-    before_stuck = motions.stuck[i]
+    before_stuck = bodies_inout.stuck[i]
     was_stuck = (before_stuck & 1) != 0
     now = wp.where(before_stuck == STUCK, ON_TRIAL, FREE)
     if stuck:
         now = wp.where(before_stuck == FREE, STUCK, STUCK_AGAIN)
-    motions.stuck[i] = now
+    bodies_inout.stuck[i] = now
     if bodies_inout.motion_type[i] != DYNAMIC or (fraction == ONE and not was_stuck):
         return
     rotation = objects_inout.rotation[i]

@@ -1,5 +1,10 @@
 """Relaxation of contact constraints: projected Gauss-Seidel (sequential impulses), one color of pairs after another.
 
+A step has substeps, each of which begins with the impulses of the one before, solves for velocities that also take
+penetrating points apart, moves the bodies, and relaxes: removes what took points apart from the velocities again.
+Points that penetrate are springs, stiff for the length of a substep, so that a stack finds its balance.
+Source: Macklin et al. 2019, Small Steps in Physics Simulation; Catto 2024, Solver2D ("soft step").
+
 Pairs of one color share no dynamic body, so one thread for all of them and a thread for each give the same bits.
 """
 
@@ -7,41 +12,69 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.lanes import block_sync
-from warp_abtree.kernels.base.poses import PairBatch
-from warp_abtree.kernels.bodies.bodies import DYNAMIC, Bodies
-from warp_abtree.kernels.bodies.constraints import Constraints, point_velocity
+from warp_abtree.kernels.base.poses import HALF, PairBatch
+from warp_abtree.kernels.bodies.bodies import DYNAMIC, ONE, ZERO, Bodies
+from warp_abtree.kernels.bodies.constraints import Constraints
 from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT
 from warp_abtree.kernels.contacts.manifold import Manifolds
 
 wp.set_module_options(native.options("base/lanes.cuh"))
 
 WARM_START = wp.constant(0)
-VELOCITY = wp.constant(1)
-POSITION = wp.constant(2)
-"""Stages of a step: impulses of the step before, velocities, and the position correction."""
+SOLVE = wp.constant(1)
+RELAX = wp.constant(2)
+"""Stages, each a pass over the contacts. WARM_START only sums up the impulses that the first substep begins with."""
+
+_FREQUENCY = 1.0  # angle that a point's spring would swing by in a substep [rad]
+_RESPONSE = 2.0 * 10.0 + _FREQUENCY  # twice its damping ratio, and that
+RECOVERY = wp.constant(wp.float64(_FREQUENCY / _RESPONSE))
+"""Part of the penetration that its spring corrects in a substep."""
+
+SOFTNESS = wp.constant(wp.float64(1.0 / (1.0 + _FREQUENCY * _RESPONSE)))
+"""Part of the impulse that it gives up."""
+
+VISITS_LEAST, VISITS_MAX = wp.constant(3), wp.constant(64)
+"""How often the points of a pair are relaxed before the next pair; more than the least while speeds change much."""
+
+SETTLED = wp.constant(wp.float64(2.0**-6))
+SETTLED_IMPACT = wp.constant(wp.float64(2.0**-30))
+"""Change of speed that is not much: part of `fast`, or of the speed at which points meet."""
 
 
 @wp.struct
 class Relaxation:
-    """Parameters of one relaxation launch."""
+    """Parameters of a pass."""
 
-    stage: wp.int32  # WARM_START, VELOCITY or POSITION
-    backward: wp.int32  # 1 if the first round goes from the last pair to the first
+    stage: wp.int32  # WARM_START, SOLVE or RELAX
+    backward: wp.int32  # 1 if it goes from the last pair to the first
     first_color: wp.int32  # first color of the range
     last_color: wp.int32  # last color of the range
-    rounds: wp.int32  # rounds over the range
-    threads: wp.int32  # threads of the launch; one block where there are several colors or rounds
+    threads: wp.int32  # threads of the launch; one block where there are several colors
     friction: wp.float64  # coefficient of Coulomb's law
-    fast: wp.float64  # separation speed of points whose position is not corrected [world units/s]; 0 without gravity
+    fast: wp.float64  # speed from which on points that meet strike [world units/s]; 0 without gravity
+    rest: wp.float64  # depth at which points rest, in slops
+    per_substep: wp.float64  # substeps a second
+    correction: wp.float64  # part of the penetration that is corrected a second, however deep [1/s]
 
 
 @wp.struct
 class Side:
-    """Constants of a pair's object while its points are relaxed."""
+    """One object of a pair, while its points are relaxed."""
 
     is_dynamic: wp.bool  # whether impulses move it
     inverse_mass: wp.float64  # [1 / mass]
     inverse_inertia: wp.mat33d  # world frame
+    moved: wp.vec3d  # by how much its centre has moved in the step [world units]
+    turned: wp.vec3d  # rotation in the step, axis times angle [rad]
+
+
+@wp.struct
+class BodyMotion:
+    """Motion of an object, with as much of it as changes in a pass."""
+
+    velocity: wp.vec3d  # of the centre of mass [world units/s]
+    angular_velocity: wp.vec3d  # world frame [rad/s]
+    momentum: wp.vec3d  # angular momentum, world frame
 
 
 @wp.func
@@ -50,23 +83,81 @@ def load_side(bodies: Bodies, i: wp.int32):
     side.is_dynamic = bodies.motion_type[i] == DYNAMIC
     side.inverse_mass = bodies.inverse_mass[i]
     side.inverse_inertia = bodies.inverse_inertia[i]
+    side.moved = bodies.moved[i]
+    side.turned = bodies.turned[i]
     return side
 
 
 @wp.func
-def push_velocity(side: Side, velocity: wp.vec3d, impulse: wp.vec3d):
-    """Return the velocity of the centre of mass after an impulse."""
-    if side.is_dynamic:
-        return velocity + side.inverse_mass * impulse
-    return velocity
+def load_motion(bodies: Bodies, i: wp.int32):
+    motion = BodyMotion()
+    motion.velocity = bodies.velocity[i]
+    motion.momentum = bodies.momentum[i]
+    motion.angular_velocity = bodies.inverse_inertia[i] * motion.momentum
+    return motion
 
 
 @wp.func
-def push_momentum(side: Side, momentum: wp.vec3d, arm: wp.vec3d, impulse: wp.vec3d):
-    """Return the angular momentum after an impulse at the end of an arm."""
+def store_motion(side: Side, motion: BodyMotion, bodies: Bodies, i: wp.int32):
     if side.is_dynamic:
-        return momentum + wp.cross(arm, impulse)
-    return momentum
+        bodies.velocity[i] = motion.velocity
+        bodies.momentum[i] = motion.momentum
+
+
+@wp.func
+def push(side: Side, motion: BodyMotion, arm: wp.vec3d, impulse: wp.vec3d):
+    """Return the motion of an object after an impulse at the end of an arm."""
+    if not side.is_dynamic:
+        return motion
+    moment = wp.cross(arm, impulse)
+    after = BodyMotion()
+    after.velocity = motion.velocity + side.inverse_mass * impulse
+    after.momentum = motion.momentum + moment
+    after.angular_velocity = motion.angular_velocity + side.inverse_inertia * moment
+    return after
+
+
+@wp.func
+def relative_velocity(motion_a: BodyMotion, motion_b: BodyMotion, arm_a: wp.vec3d, arm_b: wp.vec3d):
+    """Return the velocity of the second object relative to the first where their arms end."""
+    at_a = motion_a.velocity + wp.cross(motion_a.angular_velocity, arm_a)
+    return motion_b.velocity + wp.cross(motion_b.angular_velocity, arm_b) - at_a
+
+
+@wp.func
+def mobility(side: Side, arm: wp.vec3d, direction: wp.vec3d):
+    """Return the speed along a direction that a unit impulse along it gives an object where its arm ends."""
+    moment = wp.cross(arm, direction)
+    return wp.where(side.is_dynamic, side.inverse_mass + wp.dot(moment, side.inverse_inertia * moment), ZERO)
+
+
+@wp.func
+def approach_of(relaxation: Relaxation, slop: wp.float64, room: wp.float64):
+    """Return at what speed a point may approach [world units/s], below 0 if it is to separate.
+
+    Args:
+        room: How far it may approach [world units], below 0 if it is too deep.
+    """
+    if room >= ZERO:
+        return relaxation.per_substep * room
+    if relaxation.stage == RELAX:
+        return ZERO
+    return wp.min(RECOVERY * relaxation.per_substep * wp.max(room, -slop), relaxation.correction * room)
+
+
+@wp.func
+def friction_of(
+    a: Side, b: Side, arm_a: wp.vec3d, arm_b: wp.vec3d, most: wp.float64, impulse: wp.vec3d, slide: wp.vec3d
+):
+    """Return the friction impulse of a point that stops its tangential velocity `slide`, cut to `most`."""
+    if most <= ZERO:
+        return wp.vec3d()
+    direction = wp.normalize(slide)
+    wanted = impulse - slide / (mobility(a, arm_a, direction) + mobility(b, arm_b, direction))
+    length = wp.length(wanted)
+    if length > most:
+        wanted = wanted * (most / length)
+    return wanted
 
 
 @wp.func
@@ -75,194 +166,89 @@ def point_of_turn(i: wp.int32, count: wp.int32, backward: wp.int32):
 
 
 @wp.func
-def apply_warm_start(p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constraints: Constraints, bodies: Bodies):
-    """Apply the impulses that the points of a pair have from the step before."""
+def relax_pair(
+    relaxation: Relaxation, p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constraints: Constraints, bodies: Bodies
+):
+    """Relax the points of a pair: the normal velocity, then the tangential one within the friction cone.
+
+    The motion of both objects stays in registers meanwhile. The points are relaxed several times, until they agree.
+    An impulse acts on both objects at one place, in the middle of where they have taken the point: no momentum is lost.
+    """
+    stage, count, slop = relaxation.stage, manifolds.count[p], constraints.slop[p]
     a = load_side(bodies, pair[0])
     b = load_side(bodies, pair[1])
-    velocity_a = bodies.velocity[pair[0]]
-    velocity_b = bodies.velocity[pair[1]]
-    momentum_a = bodies.momentum[pair[0]]
-    momentum_b = bodies.momentum[pair[1]]
+    motion_a = load_motion(bodies, pair[0])
+    motion_b = load_motion(bodies, pair[1])
+    shift = b.moved - a.moved
+    settled = SETTLED * relaxation.fast
+    struck = wp.where(stage == RELAX, constraints.is_struck[p], 0)
+    visit = wp.int32(0)
+    while visit < VISITS_MAX:
+        change = wp.float64(0.0)
+        for i in range(count):
+            k = point_of_turn(i, count, relaxation.backward)
+            normal = manifolds.normal[p, k]
+            first_a, first_b = constraints.arm_a[p, k], constraints.arm_b[p, k]
+            moved = shift + wp.cross(b.turned, first_b) - wp.cross(a.turned, first_a)
+            arm_a = first_a + HALF * shift
+            arm_b = first_b - HALF * shift
+            along = constraints.impulse[p, k]
+            across = constraints.friction_impulse[p, k]
+            room = relaxation.rest * slop - manifolds.depth[p, k] + wp.dot(normal, moved)
+            speed = wp.dot(normal, relative_velocity(motion_a, motion_b, arm_a, arm_b))
+            excess = speed + approach_of(relaxation, slop, room)
+            if visit == 0:
+                settled = wp.max(settled, -SETTLED_IMPACT * speed)
+                struck = wp.where(speed < -relaxation.fast, 1, struck)
+            if along > ZERO or excess < ZERO or wp.length_sq(across) > ZERO:
+                soft = wp.where(stage == SOLVE and room < ZERO and struck == 0, SOFTNESS, ZERO)
+                mass = ONE / (mobility(a, arm_a, normal) + mobility(b, arm_b, normal))
+                after = wp.max(along - soft * along - (ONE - soft) * mass * excess, ZERO)
+                change = wp.max(change, wp.abs(after - along) / mass)
+                motion_a = push(a, motion_a, arm_a, (along - after) * normal)
+                motion_b = push(b, motion_b, arm_b, (after - along) * normal)
+                along = after
+                # What is still to come near has no friction yet.
+                most = wp.where(room > slop, ZERO, relaxation.friction * along)
+                slide = relative_velocity(motion_a, motion_b, arm_a, arm_b)
+                wanted = friction_of(a, b, arm_a, arm_b, most, across, slide - wp.dot(normal, slide) * normal)
+                motion_a = push(a, motion_a, arm_a, across - wanted)
+                motion_b = push(b, motion_b, arm_b, wanted - across)
+                across = wanted
+                constraints.impulse[p, k] = along
+                constraints.friction_impulse[p, k] = across
+        visit += 1
+        if visit >= VISITS_LEAST and change <= settled:
+            visit = VISITS_MAX
+    constraints.is_struck[p] = struck
+    store_motion(a, motion_a, bodies, pair[0])
+    store_motion(b, motion_b, bodies, pair[1])
+
+
+@wp.func
+def hand_on_impulses(p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constraints: Constraints, bodies: Bodies):
+    """Add the impulses of a pair's points to what the next substep begins with, but for those that stopped an impact.
+
+    These are not what the next substep needs: little of them may lift a body.
+    """
+    impulse = wp.vec3d()
+    moment_a = wp.vec3d()
+    moment_b = wp.vec3d()
+    half = HALF * (bodies.moved[pair[1]] - bodies.moved[pair[0]])
     for k in range(manifolds.count[p]):
-        impulse = constraints.impulse[p, k] * manifolds.normal[p, k] + constraints.friction_impulse[p, k]
-        velocity_a = push_velocity(a, velocity_a, -impulse)
-        momentum_a = push_momentum(a, momentum_a, constraints.arm_a[p, k], -impulse)
-        velocity_b = push_velocity(b, velocity_b, impulse)
-        momentum_b = push_momentum(b, momentum_b, constraints.arm_b[p, k], impulse)
-    store_motion(a, pair[0], velocity_a, momentum_a, bodies.velocity, bodies.momentum)
-    store_motion(b, pair[1], velocity_b, momentum_b, bodies.velocity, bodies.momentum)
-
-
-@wp.func
-def store_motion(
-    side: Side,
-    i: wp.int32,
-    velocity: wp.vec3d,
-    momentum: wp.vec3d,
-    velocity_out: wp.array(dtype=wp.vec3d),
-    momentum_out: wp.array(dtype=wp.vec3d),
-):
-    if side.is_dynamic:
-        velocity_out[i] = velocity
-        momentum_out[i] = momentum
-
-
-@wp.struct
-class VelocityContact:
-    """A contact point while the velocities of its pair are relaxed."""
-
-    normal: wp.vec3d  # from the first to the second object
-    arm_a: wp.vec3d  # from the centre of mass of the first body
-    arm_b: wp.vec3d  # from that of the second
-    mass: wp.float64  # effective mass along the normal
-    tangent_mass: wp.mat33d  # effective mass across it, world frame
-    approach: wp.float64  # speed at which its points may approach [world units/s]
-    impulse: wp.float64  # accumulated, along the normal
-    friction_impulse: wp.vec3d  # accumulated, across it
-
-
-@wp.func
-def load_contact(manifolds: Manifolds, constraints: Constraints, p: wp.int32, k: wp.int32):
-    c = VelocityContact()
-    c.normal = manifolds.normal[p, k]
-    c.arm_a = constraints.arm_a[p, k]
-    c.arm_b = constraints.arm_b[p, k]
-    c.mass = constraints.mass[p, k]
-    c.tangent_mass = constraints.tangent_mass[p, k]
-    c.approach = constraints.approach[p, k]
-    c.impulse = constraints.impulse[p, k]
-    c.friction_impulse = constraints.friction_impulse[p, k]
-    return c
-
-
-@wp.func
-def relax_velocities(
-    relaxation: Relaxation,
-    p: wp.int32,
-    pair: wp.vec2i,
-    backward: wp.int32,
-    manifolds: Manifolds,
-    constraints: Constraints,
-    bodies: Bodies,
-):
-    """Relax the points of a pair: the tangential velocity within the friction cone, then the normal velocity.
-
-    The motion of both objects stays in registers meanwhile, and each point is loaded while the one before is relaxed.
-    """
-    a = load_side(bodies, pair[0])
-    b = load_side(bodies, pair[1])
-    velocity_a = bodies.velocity[pair[0]]
-    velocity_b = bodies.velocity[pair[1]]
-    momentum_a = bodies.momentum[pair[0]]
-    momentum_b = bodies.momentum[pair[1]]
-    count = manifolds.count[p]
-    following = load_contact(manifolds, constraints, p, point_of_turn(0, count, backward))
-    for i in range(count):
-        k = point_of_turn(i, count, backward)
-        c = following
-        following = load_contact(manifolds, constraints, p, point_of_turn(wp.min(i + 1, count - 1), count, backward))
-        at_a = point_velocity(a.inverse_inertia, velocity_a, momentum_a, c.arm_a)
-        at_b = point_velocity(b.inverse_inertia, velocity_b, momentum_b, c.arm_b)
-        new = c.friction_impulse - c.tangent_mass * (at_b - at_a)
-        length = wp.length(new)
-        if length > relaxation.friction * c.impulse:
-            new = new * (relaxation.friction * c.impulse / length)
-        constraints.friction_impulse[p, k] = new
-        impulse = new - c.friction_impulse
-        velocity_a = push_velocity(a, velocity_a, -impulse)
-        momentum_a = push_momentum(a, momentum_a, c.arm_a, -impulse)
-        velocity_b = push_velocity(b, velocity_b, impulse)
-        momentum_b = push_momentum(b, momentum_b, c.arm_b, impulse)
-        at_a = point_velocity(a.inverse_inertia, velocity_a, momentum_a, c.arm_a)
-        at_b = point_velocity(b.inverse_inertia, velocity_b, momentum_b, c.arm_b)
-        after = wp.max(c.impulse - c.mass * (wp.dot(c.normal, at_b - at_a) + c.approach), wp.float64(0.0))
-        constraints.impulse[p, k] = after
-        impulse = (after - c.impulse) * c.normal
-        velocity_a = push_velocity(a, velocity_a, -impulse)
-        momentum_a = push_momentum(a, momentum_a, c.arm_a, -impulse)
-        velocity_b = push_velocity(b, velocity_b, impulse)
-        momentum_b = push_momentum(b, momentum_b, c.arm_b, impulse)
-    store_motion(a, pair[0], velocity_a, momentum_a, bodies.velocity, bodies.momentum)
-    store_motion(b, pair[1], velocity_b, momentum_b, bodies.velocity, bodies.momentum)
-
-
-@wp.struct
-class Overlap:
-    """A contact point while the positions of its pair are corrected."""
-
-    normal: wp.vec3d  # from the first to the second object
-    arm_a: wp.vec3d  # from the centre of mass of the first body
-    arm_b: wp.vec3d  # from that of the second
-    mass: wp.float64  # effective mass along the normal
-    bias: wp.float64  # separation speed aimed for [world units/s]
-    approach: wp.float64  # speed at which its points may approach [world units/s]
-    pseudo_impulse: wp.float64  # accumulated, of the correction
-
-
-@wp.func
-def load_overlap(manifolds: Manifolds, constraints: Constraints, p: wp.int32, k: wp.int32):
-    c = Overlap()
-    c.normal = manifolds.normal[p, k]
-    c.arm_a = constraints.arm_a[p, k]
-    c.arm_b = constraints.arm_b[p, k]
-    c.mass = constraints.mass[p, k]
-    c.bias = constraints.bias[p, k]
-    c.approach = constraints.approach[p, k]
-    c.pseudo_impulse = constraints.pseudo_impulse[p, k]
-    return c
-
-
-@wp.func
-def relax_positions(
-    relaxation: Relaxation,
-    p: wp.int32,
-    pair: wp.vec2i,
-    manifolds: Manifolds,
-    constraints: Constraints,
-    bodies: Bodies,
-):
-    """Position correction (split impulse): apply a pseudo-velocity for the penetration that the velocity leaves.
-
-    Without gravity two rigid bodies are not corrected, since that changes their angular momentum. Under gravity points
-    that separate fast are not corrected, since lifting them adds energy.
-    """
-    zero = wp.float64(0.0)
-    fast = relaxation.fast
-    a = load_side(bodies, pair[0])
-    b = load_side(bodies, pair[1])
-    if fast == zero and a.is_dynamic and b.is_dynamic:
-        return
-    # Of these the stage changes nothing.
-    velocity_a = bodies.velocity[pair[0]]
-    velocity_b = bodies.velocity[pair[1]]
-    momentum_a = bodies.momentum[pair[0]]
-    momentum_b = bodies.momentum[pair[1]]
-    pseudo_a = bodies.pseudo_velocity[pair[0]]
-    pseudo_b = bodies.pseudo_velocity[pair[1]]
-    angular_a = bodies.pseudo_momentum[pair[0]]
-    angular_b = bodies.pseudo_momentum[pair[1]]
-    count = manifolds.count[p]
-    following = load_overlap(manifolds, constraints, p, 0)
-    for k in range(count):
-        c = following
-        following = load_overlap(manifolds, constraints, p, wp.min(k + 1, count - 1))
-        at_a = point_velocity(a.inverse_inertia, velocity_a, momentum_a, c.arm_a)
-        at_b = point_velocity(b.inverse_inertia, velocity_b, momentum_b, c.arm_b)
-        speed = wp.dot(c.normal, at_b - at_a)
-        if not (fast > zero and speed >= fast):
-            at_a = point_velocity(a.inverse_inertia, pseudo_a, angular_a, c.arm_a)
-            at_b = point_velocity(b.inverse_inertia, pseudo_b, angular_b, c.arm_b)
-            separation = wp.dot(c.normal, at_b - at_a) + wp.max(speed, zero)
-            wanted = wp.max(c.bias, zero) - c.approach
-            after = wp.max(c.pseudo_impulse - c.mass * (separation - wanted), zero)
-            constraints.pseudo_impulse[p, k] = after
-            impulse = (after - c.pseudo_impulse) * c.normal
-            pseudo_a = push_velocity(a, pseudo_a, -impulse)
-            angular_a = push_momentum(a, angular_a, c.arm_a, -impulse)
-            pseudo_b = push_velocity(b, pseudo_b, impulse)
-            angular_b = push_momentum(b, angular_b, c.arm_b, impulse)
-    store_motion(a, pair[0], pseudo_a, angular_a, bodies.pseudo_velocity, bodies.pseudo_momentum)
-    store_motion(b, pair[1], pseudo_b, angular_b, bodies.pseudo_velocity, bodies.pseudo_momentum)
+        if constraints.is_struck[p] != 0:
+            constraints.impulse[p, k] = ZERO
+            constraints.friction_impulse[p, k] = wp.vec3d()
+        of_point = constraints.impulse[p, k] * manifolds.normal[p, k] + constraints.friction_impulse[p, k]
+        impulse += of_point
+        moment_a += wp.cross(constraints.arm_a[p, k] + half, of_point)
+        moment_b += wp.cross(constraints.arm_b[p, k] - half, of_point)
+    if bodies.motion_type[pair[0]] == DYNAMIC:
+        bodies.impulse[pair[0]] -= impulse
+        bodies.moment[pair[0]] -= moment_a
+    if bodies.motion_type[pair[1]] == DYNAMIC:
+        bodies.impulse[pair[1]] += impulse
+        bodies.moment[pair[1]] += moment_b
 
 
 @wp.kernel
@@ -277,8 +263,7 @@ def relax_kernel(
 ):
     """Relax the pairs of a range of colors, color by color; the threads of the launch share those of a color.
 
-    Velocity rounds alternate in direction, so that impulses travel through a stack both ways; all other stages go
-    forward. One thread relaxes the pairs without a color of their own.
+    One thread relaxes the pairs without a color of their own.
 
     Args:
         color, order: Colors in ascending order, and the pairs that have them.
@@ -286,24 +271,19 @@ def relax_kernel(
     if bodies_inout.is_whole[0] == 0:
         return
     room = order.shape[0] // 2
-    stage = relaxation.stage
+    backward = relaxation.backward
     colors = relaxation.last_color - relaxation.first_color + 1
-    for step in range(relaxation.rounds * colors):
-        backward = wp.where(stage == VELOCITY, (relaxation.backward + step / colors) % 2, 0)
-        c = relaxation.first_color + point_of_turn(step % colors, colors, backward)
+    for step in range(colors):
+        c = relaxation.first_color + point_of_turn(step, colors, backward)
         start = wp.lower_bound(color, 0, room, c)
         end = wp.lower_bound(color, 0, room, c + 1)
         threads = wp.where(c == COLOR_COUNT, 1, relaxation.threads)
         if wp.tid() < threads:
             for turn in range(wp.tid(), end - start, threads):
                 p = order[wp.where(backward != 0, end - 1 - turn, start + turn)]
-                if stage == WARM_START:
-                    apply_warm_start(p, batch.pairs[p], manifolds, constraints_inout, bodies_inout)
-                elif stage == VELOCITY:
-                    relax_velocities(
-                        relaxation, p, batch.pairs[p], backward, manifolds, constraints_inout, bodies_inout
-                    )
-                else:
-                    relax_positions(relaxation, p, batch.pairs[p], manifolds, constraints_inout, bodies_inout)
+                if relaxation.stage != WARM_START:
+                    relax_pair(relaxation, p, batch.pairs[p], manifolds, constraints_inout, bodies_inout)
+                if relaxation.stage != SOLVE:
+                    hand_on_impulses(p, batch.pairs[p], manifolds, constraints_inout, bodies_inout)
         if colors > 1:
             block_sync()

@@ -21,6 +21,7 @@ from warp_abtree.kernels.bodies import graph_coloring
 from warp_abtree.simulate.body_state import mass_properties
 from warp_abtree.simulate.budget_report import budget_report, cost_at_coarsest
 from warp_abtree.simulate.frame_row import FrameRow
+from warp_abtree.simulate.rigid_bodies import SUBSTEPS
 
 
 @cache
@@ -104,12 +105,12 @@ def test_a_free_body_flies_and_tumbles_about_its_centre_of_mass(device):
     assert errors[0] < 0.02 and errors[1] < errors[0] / 3
 
 
-def test_gravity_is_semi_implicit_euler(device):
+def test_gravity_is_semi_implicit_euler_in_substeps(device):
     dynamics = make(device, (CUBE, (0, 0, 0, 0, 0, 0, 1)), gravity=(0, 0, -8), velocity=(0.5, 0, 1))
     run(dynamics, 10, 0.125)
-    falls = 1 - np.cumsum(np.full(10, 8 * 0.125))
-    np.testing.assert_allclose(dynamics.velocities()[0][0], [0.5, 0, 1 + 0 - 8 * 1.25], rtol=1e-15)
-    np.testing.assert_allclose(dynamics.poses()[0, :3], [0.625, 0, 0.125 * falls.sum()], rtol=1e-14)
+    falls = 1 - np.cumsum(np.full(10 * SUBSTEPS, 8 * 0.125 / SUBSTEPS))
+    np.testing.assert_allclose(dynamics.velocities()[0][0], [0.5, 0, 1 + 0 - 8 * 1.25], rtol=1e-14)
+    np.testing.assert_allclose(dynamics.poses()[0, :3], [0.625, 0, 0.125 / SUBSTEPS * falls.sum()], rtol=1e-13)
 
 
 @pytest.mark.parametrize("friction", [0, 0.5])
@@ -161,8 +162,8 @@ def test_corrections_of_place_leave_velocity_and_energy(device):
     found = totals(dynamics)
     lifted = dynamics.poses()[1, 2] - 0.4 - 0.01 * 0.3
     assert lifted > 0.005
-    np.testing.assert_allclose(found[0], start[0], rtol=1e-12)
-    assert found[2] == pytest.approx(start[2], rel=1e-3)
+    np.testing.assert_allclose(found[0], start[0], rtol=1e-12, atol=1e-15)
+    assert 0.99 * start[2] < found[2] < (1 + 1e-12) * start[2]
 
 
 @pytest.mark.parametrize("angle, friction", [(0.3, 0.4), (0.5, 0.2), (0.4, 0.0)])
@@ -249,7 +250,7 @@ def test_a_kinematic_floor_carries_and_stops(device):
 COLORS = int(graph_coloring.COLOR_COUNT)
 
 
-def color_pairs(device, pairs, dynamic, rounds):
+def color_pairs(device, pairs, dynamic):
     """Return the color of each pair, COLORS where it has none."""
     bodies = zeros_of(body_kernels.Bodies, len(dynamic), 0, device)
     bodies.motion_type.assign(np.where(dynamic, int(body_kernels.DYNAMIC), 0))
@@ -257,9 +258,9 @@ def color_pairs(device, pairs, dynamic, rounds):
     color = wp.full(len(pairs), COLORS, dtype=wp.int32, device=device)
     batch = PairBatch()
     batch.pairs = wp.array(pairs, dtype=wp.vec2i, device=device)
-    for turn in range(COLORS * rounds):
+    for turn in range(COLORS):
         for kernel in (graph_coloring.bid_kernel, graph_coloring.assign_color_kernel):
-            wp.launch(kernel, len(pairs), [turn, rounds, batch, color, bodies], device=device)
+            wp.launch(kernel, len(pairs), [turn, batch, color, bodies], device=device)
     return color.numpy()
 
 
@@ -271,17 +272,14 @@ def test_no_moving_body_is_twice_in_a_color(device, seed):
     dynamic = rng.uniform(size=300) < 0.9
     pairs = pairs[dynamic[pairs].any(1)]
     degree = np.bincount(pairs.ravel(), minlength=300)[dynamic].max()
-    used = []
-    for rounds in (1, 2, 4):
-        color = color_pairs(device, pairs, dynamic, rounds)
-        assert np.array_equal(color, color_pairs(device, pairs, dynamic, rounds)), "the same again"
-        for c in range(COLORS):
-            movers = pairs[color == c].ravel()
-            movers = movers[dynamic[movers]]
-            assert len(set(movers.tolist())) == len(movers)
-        used.append(len(set(color.tolist())))
-    # Of one round there are many; of more hardly more than there must be.
-    assert degree <= used[2] <= used[1] < used[0] and used[2] <= degree + 2
+    color = color_pairs(device, pairs, dynamic)
+    assert np.array_equal(color, color_pairs(device, pairs, dynamic)), "the same again"
+    for c in range(COLORS):
+        movers = pairs[color == c].ravel()
+        movers = movers[dynamic[movers]]
+        assert len(set(movers.tolist())) == len(movers)
+    # Hardly more than there must be, and hardly a pair without.
+    assert degree <= len(set(color.tolist())) <= degree + 2 and (color == COLORS).mean() < 0.01
 
 
 def test_motion_in_a_straight_line():

@@ -26,9 +26,10 @@ from warp_abtree.simulate.body_state import RigidBodies
 from warp_abtree.simulate.contacts_ahead import AheadGapStage
 from warp_abtree.simulate.continuous import CertifiedMotions
 
-SHELL = 0.75 * float(body_kernels.LOOKAHEAD_LEAST)  # with continuous bodies rest half a slop apart or more, in reach
-ITERATIONS = 32  # rounds of relaxation over all contacts in a step
-COLOR_ROUNDS = 2  # of the graph coloring, each color; one makes almost twice as many colors
+SUBSTEPS = 8  # of a step
+REST_DEPTH, REST_APART = 0.5, 1.0  # at which points rest, in slops: deep, or with `continuous` apart, within reach
+CORRECTION = 0.2  # part of the penetration that a step corrects, however deep
+COLOR_ROUNDS = int(COLOR_COUNT)  # of the graph coloring
 LAST_COLORS = 8  # first of the last colors, which one block relaxes
 # Threads of a block: few pairs of a color lie on as many multiprocessors, and the last colors on one.
 RELAX_THREADS, TAIL_THREADS = 32, 256
@@ -87,8 +88,7 @@ class Dynamics(RigidBodies):
             self.certified = CertifiedMotions(scene, self.bodies, Buffers(pairs=check_capacity(capacity).pairs))
         # No body is in two pairs of a color.
         self._color_room = max(1, int(np.count_nonzero(self.rigid)))
-        # On the CPU threads run one after another, and a color more costs nothing.
-        self._tail_threads, self._color_rounds = (TAIL_THREADS, COLOR_ROUNDS) if self.device.is_cuda else (1, 1)
+        self._tail_threads = TAIL_THREADS if self.device.is_cuda else 1
         self._warm_start = constraint_kernels.WarmStart()
         self._room, self._interrupted = -1, False
         self._grow()
@@ -163,26 +163,33 @@ class Dynamics(RigidBodies):
         Where contacts or pairs outran the capacity nothing moves.
         """
         self._check_whole()
-        n, room, query, bodies = len(self.mass), self._room, self.query, self.bodies
-        fast = 2.0 * float(np.linalg.norm(self.gravity)) * dt
+        n, room, query, bodies, h = len(self.mass), self._room, self.query, self.bodies, dt / SUBSTEPS
         posed = [query.pair_batch, self._pool, query.manifolds]
+        each = solve.Relaxation()
+        each.friction, each.fast = self.friction, 2.0 * float(np.linalg.norm(self.gravity)) * dt
+        each.rest = REST_DEPTH if self.certified is None else -REST_APART
+        each.per_substep, each.correction = 1.0 / h, CORRECTION / dt
         with self._changing():
             self._launch(body_kernels.judge_contacts_kernel, 1, [query.pair_batch, query.hits, bodies])
-            inputs = [dt, wp.vec3d(*(dt * self.gravity)), self.targets, self._pool, bodies]
-            self._launch(body_kernels.begin_step_kernel, n, inputs)
-            shell = 0.0 if self.certified is None else SHELL
-            inputs = [dt, fast, shell, *posed, self._warm_start, bodies, self._sorted_pair, self.constraints]
+            self._launch(body_kernels.begin_step_kernel, n, [dt, self.targets, self._pool, bodies])
+            inputs = [each.fast, *posed, self._warm_start, bodies, self._sorted_pair, self.constraints]
             self._launch(constraint_kernels.prepare_constraints_kernel, room, inputs)
             self._color_pairs()
-            self._relax(solve.WARM_START, 1, fast)
-            self._relax(solve.VELOCITY, ITERATIONS, fast)
-            self._relax(solve.POSITION, ITERATIONS, fast)
-            inputs = [fast, query.broad_phase.key, *posed, self.constraints, bodies, self._warm_start]
+            self._relax(each, solve.WARM_START)
+            for _ in range(SUBSTEPS):
+                self._launch(body_kernels.begin_substep_kernel, n, [wp.vec3d(*(h * self.gravity)), bodies])
+                self._relax(each, solve.SOLVE)
+                self._launch(body_kernels.move_bodies_kernel, n, [h, bodies])
+                if self.certified is not None:
+                    self.certified.keep_solved()
+                self._relax(each, solve.RELAX)
+                if self.certified is not None:
+                    self.certified.free_stuck(h)
+            inputs = [query.broad_phase.key, *posed, self.constraints, bodies, self._warm_start]
             self._launch(constraint_kernels.save_impulses_kernel, room, inputs)
             posed = self._pool if self.certified is None else self.certified.goals
-            self._launch(body_kernels.integrate_kernel, n, [dt, self.targets, bodies, posed])
+            self._launch(body_kernels.pose_objects_kernel, n, [dt, self.targets, bodies, posed])
             if self.certified is not None:
-                self.certified.free_stuck(dt)
                 self.certified.launch()
                 self.certified.end(dt * self.gravity)
 
@@ -222,38 +229,30 @@ class Dynamics(RigidBodies):
 
     def _color_pairs(self):
         """Color the pairs in contact, and sort all pairs by color."""
-        room, found = self._room, [self.query.pair_batch, self.constraints.color, self.bodies]
-        rounds, color = self._color_rounds, self.constraints.color
-        for turn in range(COLOR_COUNT * rounds):
-            self._launch(graph_coloring.bid_kernel, room, [turn, rounds, *found])
-            self._launch(graph_coloring.assign_color_kernel, room, [turn, rounds, *found])
+        room, color = self._room, self.constraints.color
+        for turn in range(COLOR_ROUNDS):
+            for kernel in (graph_coloring.bid_kernel, graph_coloring.assign_color_kernel):
+                self._launch(kernel, room, [turn, self.query.pair_batch, color, self.bodies])
         wp.copy(self._sorted_color, color, count=room)
         with wp.ScopedDevice(self.device):
             wp.utils.radix_sort_pairs(self._sorted_color, self._sorted_pair, room, end_bit=7)
 
-    def _relax(self, stage, rounds, fast):
-        """Relax all pairs: by one thread in one launch, or a launch for each of the first colors of each round.
+    def _relax(self, each, stage):
+        """Relax all pairs: by one thread in one launch, or a launch for each of the first colors.
 
-        The last colors have few pairs: a block relaxes them, with those of the next round where it goes backward.
+        The last colors have few pairs: a block relaxes them.
         """
-        each = solve.Relaxation()
-        each.stage, each.friction, each.fast = int(stage), self.friction, fast
+        each.stage, each.backward = int(stage), int(stage == solve.RELAX)
         if not self._by_color:
-            self._relax_colors(each, range(COLOR_COUNT + 1), rounds, 1)
+            self._relax_colors(each, range(COLOR_COUNT + 1), 1)
             return
-        head, tail = range(LAST_COLORS), range(LAST_COLORS, COLOR_COUNT + 1)
-        alternates = stage == solve.VELOCITY
-        for turn in range(rounds):
-            each.backward = turn % 2 if alternates else 0
-            for color in [] if each.backward else head:
-                self._relax_colors(each, [color], 1, self._color_room)
-            if not each.backward:
-                self._relax_colors(each, tail, min(2, rounds - turn) if alternates else 1, self._tail_threads)
-            for color in reversed(head) if each.backward else []:
-                self._relax_colors(each, [color], 1, self._color_room)
+        parts = [([color], self._color_room) for color in range(LAST_COLORS)]
+        parts.append((range(LAST_COLORS, COLOR_COUNT + 1), self._tail_threads))
+        for colors, threads in reversed(parts) if each.backward else parts:
+            self._relax_colors(each, colors, threads)
 
-    def _relax_colors(self, each, colors, rounds, threads):
-        each.first_color, each.last_color, each.rounds, each.threads = colors[0], colors[-1], rounds, threads
+    def _relax_colors(self, each, colors, threads):
+        each.first_color, each.last_color, each.threads = colors[0], colors[-1], threads
         arrays = [self._sorted_pair, self._sorted_color, self.query.pair_batch, self.query.manifolds]
         block = RELAX_THREADS if len(colors) == 1 else TAIL_THREADS
         self._launch(solve.relax_kernel, threads, [each, *arrays, self.constraints, self.bodies], block)
