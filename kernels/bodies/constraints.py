@@ -89,6 +89,11 @@ def prepare_constraints_kernel(
     row = wp.min(wp.lower_bound(warm_start.key, key), warm_start.key.shape[0] - 1)
     known = warm_start.key[row] == key
     used = wp.int32(0)
+    before = wp.float64(0.0)
+    if known:
+        for k in range(warm_start.count[row]):
+            before += warm_start.impulse[row, k]
+    total = wp.float64(0.0)
     for k in range(manifolds.count[p]):
         x = manifolds.point[p, k]
         normal = manifolds.normal[p, k]
@@ -102,11 +107,18 @@ def prepare_constraints_kernel(
         if known and wp.abs(speed) <= fast:
             local = wp.transpose(objects.rotation[a]) * (x - objects.position[a])
             match = find_match(warm_start, row, MATCH_RADIUS * radius, local, used)
+            if match < 0 and before > wp.float64(0.0):
+                constraints_out.impulse[p, k] = before / wp.float64(warm_start.count[row])
             if match >= 0:
                 used = used | (1 << match)
                 friction = warm_start.friction_impulse[row, match]
                 constraints_out.impulse[p, k] = warm_start.impulse[row, match]
                 constraints_out.friction_impulse[p, k] = friction - wp.dot(friction, normal) * normal
+            total += constraints_out.impulse[p, k]
+    if total > wp.float64(0.0):
+        # Points come and go where many would do; what the pair bears together stays.
+        for k in range(manifolds.count[p]):
+            constraints_out.impulse[p, k] = (before / total) * constraints_out.impulse[p, k]
 
 
 @wp.kernel

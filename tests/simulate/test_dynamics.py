@@ -213,6 +213,30 @@ def test_a_stack_of_five_stands_for_ten_seconds(device, splits, remember):
     assert not remember or (dynamics.query.memory.place.numpy()[:5] >= 0).all()
 
 
+@pytest.mark.parametrize("offset", [0.0, 0.01, 0.02])
+@pytest.mark.slow
+def test_a_stack_of_ten_drifts_by_less_than_a_millimetre(device, offset):
+    dynamics = on_ground(device, *((CUBE, (offset * (k % 2), 0, 0.5 + k, 0, 0, 0, 1)) for k in range(10)))
+    start = dynamics.poses()[1:, :2]
+    run(dynamics, 600, 1 / 60)
+    assert np.linalg.norm(dynamics.poses()[1:, :2] - start, axis=1).max() < 1e-3
+    assert np.abs(dynamics.velocities()[0]).max() < 1e-4
+
+
+def test_contact_points_that_come_and_go_do_not_shake_a_stack(device):
+    """Boxes turned against each other have more corners than points: which are chosen changes from step to step."""
+    part = box(0.8, 0.6, 0.4)
+    dynamics = on_ground(device, *((part, (0, 0, 0.21 + 0.41 * k, *about((0, 0, 1), 0.3 * k))) for k in range(3)))
+    run(dynamics, 400, 1 / 60)
+    assert np.abs(dynamics.poses()[1:, :2]).max() < 5e-4 and np.abs(dynamics.velocities()[0]).max() < 0.02
+
+
+def test_a_heavy_cube_stands_on_a_light_one(device):
+    dynamics = on_ground(device, (CUBE, (0, 0, 0.5, 0, 0, 0, 1)), (box(4, 4, 4), (0, 0, 3, 0, 0, 0, 1)))
+    run(dynamics, 240, 1 / 60)
+    np.testing.assert_allclose(dynamics.poses()[1:, :3], [[0, 0, 0.5], [0, 0, 3]], atol=0.015)
+
+
 def test_a_torus_falls_over_a_peg_and_stays(device):
     peg = model_of(trimesh.creation.cylinder(0.3, 1.2, sections=8))
     ring = model_of(trimesh.creation.torus(0.8, 0.25, 16, 8))

@@ -1,9 +1,9 @@
 """Rigid bodies that respond to the contacts of their meshes: `Dynamics`.
 
-One step: contacts where the bodies stand, and where they first meet as far ahead as they move; gravity;
-contact impulses by projected Gauss-Seidel with warm starting and Coulomb friction; position correction by split
-impulses; semi-implicit Euler with a symplectic rotation; with `continuous`, motions cut where surfaces would meet. All
-in float64; docs/dynamics.md has each part, what is conserved and repeated, figures, and limits.
+One step: contacts where the bodies stand, and where they first meet as far ahead as they move; substeps of gravity,
+contact impulses by projected Gauss-Seidel with warm starting and Coulomb friction, soft where points penetrate, motion
+by semi-implicit Euler with a symplectic rotation, and relaxation; with `continuous`, motions cut where surfaces would
+meet. All in float64; docs/dynamics.md has each part, what is conserved and repeated, figures, and limits.
 """
 
 from contextlib import contextmanager
