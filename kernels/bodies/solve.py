@@ -33,6 +33,9 @@ RECOVERY = wp.constant(wp.float64(_FREQUENCY / _RESPONSE))
 SOFTNESS = wp.constant(wp.float64(1.0 / (1.0 + _FREQUENCY * _RESPONSE)))
 """Part of the impulse that it gives up."""
 
+SPRING = wp.constant(wp.float64(8.0))
+"""Penetration up to which it is a spring, in slops; beyond that its recovery is a part of the penetration in a step."""
+
 VISITS_LEAST, VISITS_MAX = wp.constant(3), wp.constant(64)
 """How often the points of a pair are relaxed before the next pair; more than the least while speeds change much."""
 
@@ -132,17 +135,18 @@ def mobility(side: Side, arm: wp.vec3d, direction: wp.vec3d):
 
 
 @wp.func
-def approach_of(relaxation: Relaxation, slop: wp.float64, room: wp.float64):
+def approach_of(relaxation: Relaxation, corrects: bool, slop: wp.float64, room: wp.float64):
     """Return at what speed a point may approach [world units/s], below 0 if it is to separate.
 
     Args:
+        corrects: Whether points that are too deep are to separate.
         room: How far it may approach [world units], below 0 if it is too deep.
     """
     if room >= ZERO:
         return relaxation.per_substep * room
-    if relaxation.stage == RELAX:
+    if not corrects:
         return ZERO
-    return wp.min(RECOVERY * relaxation.per_substep * wp.max(room, -slop), relaxation.correction * room)
+    return wp.min(RECOVERY * relaxation.per_substep * wp.max(room, -SPRING * slop), relaxation.correction * room)
 
 
 @wp.func
@@ -180,6 +184,8 @@ def relax_pair(
     motion_a = load_motion(bodies, pair[0])
     motion_b = load_motion(bodies, pair[1])
     shift = b.moved - a.moved
+    # Without gravity two rigid bodies are not pushed apart, which would add energy.
+    corrects = stage == SOLVE and (relaxation.fast > ZERO or not (a.is_dynamic and b.is_dynamic))
     settled = SETTLED * relaxation.fast
     struck = wp.where(stage == RELAX, constraints.is_struck[p], 0)
     visit = wp.int32(0)
@@ -196,12 +202,12 @@ def relax_pair(
             across = constraints.friction_impulse[p, k]
             room = relaxation.rest * slop - manifolds.depth[p, k] + wp.dot(normal, moved)
             speed = wp.dot(normal, relative_velocity(motion_a, motion_b, arm_a, arm_b))
-            excess = speed + approach_of(relaxation, slop, room)
+            excess = speed + approach_of(relaxation, corrects, slop, room)
             if visit == 0:
                 settled = wp.max(settled, -SETTLED_IMPACT * speed)
                 struck = wp.where(speed < -relaxation.fast, 1, struck)
             if along > ZERO or excess < ZERO or wp.length_sq(across) > ZERO:
-                soft = wp.where(stage == SOLVE and room < ZERO and struck == 0, SOFTNESS, ZERO)
+                soft = wp.where(corrects and room < ZERO and struck == 0, SOFTNESS, ZERO)
                 mass = ONE / (mobility(a, arm_a, normal) + mobility(b, arm_b, normal))
                 after = wp.max(along - soft * along - (ONE - soft) * mass * excess, ZERO)
                 change = wp.max(change, wp.abs(after - along) / mass)

@@ -26,7 +26,8 @@ from warp_abtree.simulate.body_state import RigidBodies
 from warp_abtree.simulate.contacts_ahead import AheadGapStage
 from warp_abtree.simulate.continuous import CertifiedMotions
 
-SUBSTEPS = 8  # of a step
+SUBSTEPS_LEAST, SUBSTEPS_MAX = 8, 32  # of a step
+GIVE = 0.5  # slops that springs may give for each body borne, unless that takes more substeps
 REST_DEPTH, REST_APART = 0.5, 1.0  # at which points rest, in slops: deep, or with `continuous` apart, within reach
 CORRECTION = 0.2  # part of the penetration that a step corrects, however deep
 COLOR_ROUNDS = int(COLOR_COUNT)  # of the graph coloring
@@ -86,6 +87,8 @@ class Dynamics(RigidBodies):
         self.certified = None
         if flag(continuous, "continuous"):
             self.certified = CertifiedMotions(scene, self.bodies, Buffers(pairs=check_capacity(capacity).pairs))
+        radii = self.bodies.bounding_radius.numpy()[self.rigid]
+        self._least_slop = float(constraint_kernels.SLOP) * radii.min(initial=np.inf)
         # No body is in two pairs of a color.
         self._color_room = max(1, int(np.count_nonzero(self.rigid)))
         self._tail_threads = TAIL_THREADS if self.device.is_cuda else 1
@@ -139,6 +142,14 @@ class Dynamics(RigidBodies):
         self.answer(dt)
         self.finish(dt)
 
+    def substeps(self, dt: float) -> int:
+        """Return how many substeps a step has: more the longer it is, and the smaller its smallest body.
+
+        A contact gives by about twice the square of a substep times gravity for each body borne.
+        """
+        wanted = dt * np.sqrt(2.0 * np.linalg.norm(self.gravity) / (GIVE * self._least_slop))
+        return int(np.clip(np.ceil(wanted), SUBSTEPS_LEAST, SUBSTEPS_MAX))
+
     def find(self, targets=None):
         """Do the first half of `step`: find the contacts where the bodies stand, without moving them."""
         self._check_whole()
@@ -163,7 +174,9 @@ class Dynamics(RigidBodies):
         Where contacts or pairs outran the capacity nothing moves.
         """
         self._check_whole()
-        n, room, query, bodies, h = len(self.mass), self._room, self.query, self.bodies, dt / SUBSTEPS
+        n, room, query, bodies = len(self.mass), self._room, self.query, self.bodies
+        substeps = self.substeps(dt)
+        h = dt / substeps
         posed = [query.pair_batch, self._pool, query.manifolds]
         each = solve.Relaxation()
         each.friction, each.fast = self.friction, 2.0 * float(np.linalg.norm(self.gravity)) * dt
@@ -176,7 +189,7 @@ class Dynamics(RigidBodies):
             self._launch(constraint_kernels.prepare_constraints_kernel, room, inputs)
             self._color_pairs()
             self._relax(each, solve.WARM_START)
-            for _ in range(SUBSTEPS):
+            for _ in range(substeps):
                 self._launch(body_kernels.begin_substep_kernel, n, [wp.vec3d(*(h * self.gravity)), bodies])
                 self._relax(each, solve.SOLVE)
                 self._launch(body_kernels.move_bodies_kernel, n, [h, bodies])
@@ -246,7 +259,7 @@ class Dynamics(RigidBodies):
         if not self._by_color:
             self._relax_colors(each, range(COLOR_COUNT + 1), 1)
             return
-        parts = [([color], self._color_room) for color in range(LAST_COLORS)]
+        parts: list[tuple] = [([color], self._color_room) for color in range(LAST_COLORS)]
         parts.append((range(LAST_COLORS, COLOR_COUNT + 1), self._tail_threads))
         for colors, threads in reversed(parts) if each.backward else parts:
             self._relax_colors(each, colors, threads)
