@@ -124,9 +124,11 @@ def begin_substep_kernel(velocity_change: wp.vec3d, bodies_inout: Bodies):
 
 @wp.kernel
 def move_bodies_kernel(h: wp.float64, bodies_inout: Bodies):
-    """Move an object by its velocity for the time of a substep, unless it is stuck."""
+    """Move an object by its velocity for the time of a substep, unless it is a stuck body."""
     i = wp.tid()
-    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] == STATIC or (bodies_inout.stuck[i] & 1) != 0:
+    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] == STATIC:
+        return
+    if bodies_inout.motion_type[i] == DYNAMIC and (bodies_inout.stuck[i] & 1) != 0:
         return
     momentum = bodies_inout.momentum[i]
     bodies_inout.moved[i] += h * bodies_inout.velocity[i]
