@@ -33,9 +33,6 @@ RECOVERY = wp.constant(wp.float64(_FREQUENCY / _RESPONSE))
 SOFTNESS = wp.constant(wp.float64(1.0 / (1.0 + _FREQUENCY * _RESPONSE)))
 """Part of the impulse that it gives up."""
 
-SPRING = wp.constant(wp.float64(8.0))
-"""Penetration up to which it is a spring, in slops; beyond that its recovery is a part of the penetration in a step."""
-
 VISITS_LEAST, VISITS_MAX = wp.constant(3), wp.constant(64)
 """How often the points of a pair are relaxed before the next pair; more than the least while speeds change much."""
 
@@ -146,7 +143,7 @@ def approach_of(relaxation: Relaxation, corrects: bool, slop: wp.float64, room: 
         return relaxation.per_substep * room
     if not corrects:
         return ZERO
-    return wp.min(RECOVERY * relaxation.per_substep * wp.max(room, -SPRING * slop), relaxation.correction * room)
+    return wp.min(RECOVERY * relaxation.per_substep * wp.max(room, -slop), relaxation.correction * room)
 
 
 @wp.func

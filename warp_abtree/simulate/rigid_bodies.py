@@ -27,7 +27,7 @@ from warp_abtree.simulate.contacts_ahead import AheadGapStage
 from warp_abtree.simulate.continuous import CertifiedMotions
 
 SUBSTEPS_LEAST, SUBSTEPS_MAX = 8, 32  # of a step
-GIVE = 0.5  # slops that springs may give for each body borne, unless that takes more substeps
+GIVE = 0.25  # slops that springs may give for each body borne, unless that takes more substeps
 REST_DEPTH, REST_APART = 0.5, 1.0  # at which points rest, in slops: deep, or with `continuous` apart, within reach
 CORRECTION = 0.2  # part of the penetration that a step corrects, however deep
 COLOR_ROUNDS = int(COLOR_COUNT)  # of the graph coloring
