@@ -5,7 +5,8 @@ import signal
 import threading
 
 IMPORTS = "<frozen importlib._bootstrap>"  # the code that runs while a module is imported
-DELAY = 0.05  # seconds after which a signal comes again
+DELAY = 0.01  # seconds after which a signal comes again
+_deferred = []  # the signal that comes again
 
 
 def not_swallowed(handler):
@@ -15,21 +16,30 @@ def not_swallowed(handler):
         caller = frame
         while caller is not None:
             if caller.f_code.co_filename == IMPORTS or caller.f_code.co_name == "__del__":
-                send = (signal.raise_signal, [number]) if os.name == "nt" else (os.kill, [os.getpid(), number])
-                again = threading.Timer(DELAY, *send)
+                _deferred[:] = [number]
+                again = threading.Timer(DELAY, send, [number])
                 again.daemon = True
                 again.start()
                 return
             caller = caller.f_back
+        _deferred.clear()
         handler(number, frame)
 
     return handle
 
 
+def send(number):
+    """Send a signal to this process."""
+    if os.name == "nt":
+        signal.raise_signal(number)
+    else:
+        os.kill(os.getpid(), number)
+
+
 def handle_signals(interrupt, terminate):
     """Let SIGINT and SIGTERM call handlers, although the process may have inherited that they are ignored.
 
-    Shells start background jobs with SIGINT ignored.
+    Shells start background jobs with SIGINT ignored. A signal that the handlers before deferred goes to these.
     """
     if threading.current_thread() is not threading.main_thread():
         return  # only the main thread may, and receives signals
@@ -37,3 +47,5 @@ def handle_signals(interrupt, terminate):
     signal.signal(signal.SIGTERM, terminate)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+    if _deferred:
+        send(_deferred.pop())
