@@ -20,6 +20,7 @@ class ObjectList:
 
     models: list[Model] = field(default_factory=list)
     model: list[int] = field(default_factory=list)  # index into models
+    name: list[str | None] = field(default_factory=list)
     world: list[int] = field(default_factory=list)
     lod: list[int] = field(default_factory=list)
     importance: list[int] = field(default_factory=list)
@@ -135,7 +136,22 @@ def check_bools(values, what: str, count: int) -> list[bool]:
     return flags.tolist()
 
 
-def check_columns(models, worlds, importances, flags, bits) -> dict[str, list]:
+def check_names(names, count: int) -> list[str | None]:
+    """Return names: None for all objects, or (count,).
+
+    Raises:
+        ValueError: Another number of them, or one that is no string with a character.
+    """
+    listed = [None] * count if names is None else list(names)
+    if len(listed) != count:
+        raise ValueError(f"names: {len(listed)} given for {count} objects")
+    for name in listed:
+        if name is not None and not (isinstance(name, str) and name):
+            raise ValueError(f"name {name!r} is no string with a character")
+    return listed
+
+
+def check_columns(models, names, worlds, importances, flags, bits) -> dict[str, list]:
     """Return the columns of `ObjectList` for objects of these models.
 
     Args:
@@ -148,6 +164,7 @@ def check_columns(models, worlds, importances, flags, bits) -> dict[str, list]:
     """
     count, (statics, solids), (groups, masks) = len(models), flags, bits
     columns: dict[str, list] = {
+        "name": check_names(names, count),
         "world": check_numbers(worlds, "world", EVERY_WORLD, 2**31 - 1, count),
         "importance": check_numbers(importances, "importance", 1, 3, count),
         "static": check_bools(statics, "static", count),

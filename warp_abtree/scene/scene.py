@@ -81,6 +81,16 @@ class Scene(DeviceMemory):
         """LOD of each object, int32 (n,)."""
         return np.array(self._objects.lod if self._batch is None else self._batch.lods, np.int32)
 
+    def name(self, i) -> str:
+        """Return the name of object i.
+
+        Raises:
+            ValueError: No such object.
+        """
+        i = whole_number(i, "object", 0, self.object_count - 1)
+        told = self._objects.name[i]
+        return f"{self.models[self.object_model[i]].name} {i}" if told is None else told
+
     def add(
         self,
         model,
@@ -92,6 +102,7 @@ class Scene(DeviceMemory):
         collision_group=1,
         collision_mask=ALL_BITS,
         solid=False,
+        name=None,
     ) -> int:
         """Add an object and return its index.
 
@@ -106,6 +117,7 @@ class Scene(DeviceMemory):
                 `warp_abtree.state.solids`.
             collision_group, collision_mask: Bits, from 0 to 2^32 - 1. The broad phase pairs objects a and b only where
                 group_a & mask_b and group_b & mask_a both hold a bit.
+            name: What results and pictures call it; None is its model's name and its index.
 
         Raises:
             TypeError: model is no Model.
@@ -115,7 +127,7 @@ class Scene(DeviceMemory):
         """
         models = check_models(model, 1)
         poses = check_poses(to_numpy(pose, "pose")[None], "pose")
-        columns = check_columns(models, world, importance, (static, solid), (collision_group, collision_mask))
+        columns = check_columns(models, [name], world, importance, (static, solid), (collision_group, collision_mask))
         return int(self._extend(models, poses, lod, columns)[0])
 
     def add_many(
@@ -129,6 +141,7 @@ class Scene(DeviceMemory):
         collision_groups=1,
         collision_masks=ALL_BITS,
         solids=False,
+        names=None,
     ) -> np.ndarray:
         """Add an object for each pose and return their indices, int (n,): all of them, or none.
 
@@ -137,13 +150,14 @@ class Scene(DeviceMemory):
             poses: (n, 7) or (n, 4, 4), of any framework, see `add`.
             worlds, lods, importances, statics, solids, collision_groups, collision_masks: As for `add`, one for all or
                 (n,).
+            names: (n,) strings, or None.
 
         Raises:
             TypeError, ValueError, RuntimeError: As `add`; or not n were given.
         """
         poses = check_poses(poses)
         models = check_models(models, len(poses))
-        columns = check_columns(models, worlds, importances, (statics, solids), (collision_groups, collision_masks))
+        columns = check_columns(models, names, worlds, importances, (statics, solids), (collision_groups, collision_masks))
         return self._extend(models, poses, lods, columns)
 
     def _extend(self, models, poses, lods, columns) -> np.ndarray:
