@@ -136,7 +136,7 @@ def check_bools(values, what: str, count: int) -> list[bool]:
     return flags.tolist()
 
 
-def check_names(names, count: int) -> list[str | None]:
+def check_object_names(names, count: int) -> list[str | None]:
     """Return names: None for all objects, or (count,).
 
     Raises:
@@ -164,7 +164,7 @@ def check_columns(models, names, worlds, importances, flags, bits) -> dict[str, 
     """
     count, (statics, solids), (groups, masks) = len(models), flags, bits
     columns: dict[str, list] = {
-        "name": check_names(names, count),
+        "name": check_object_names(names, count),
         "world": check_numbers(worlds, "world", EVERY_WORLD, 2**31 - 1, count),
         "importance": check_numbers(importances, "importance", 1, 3, count),
         "static": check_bools(statics, "static", count),

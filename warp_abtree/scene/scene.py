@@ -157,7 +157,9 @@ class Scene(DeviceMemory):
         """
         poses = check_poses(poses)
         models = check_models(models, len(poses))
-        columns = check_columns(models, names, worlds, importances, (statics, solids), (collision_groups, collision_masks))
+        columns = check_columns(
+            models, names, worlds, importances, (statics, solids), (collision_groups, collision_masks)
+        )
         return self._extend(models, poses, lods, columns)
 
     def _extend(self, models, poses, lods, columns) -> np.ndarray:
