@@ -233,7 +233,7 @@ def kernel_faults(tree):
 
 
 def size_faults(tree, text):
-    """List functions that are too long or take too many arguments, and a file that is too long."""
+    """List functions that are too long or take too many arguments beside those by name, and a file that is too long."""
     count = len(text.splitlines())
     faults = [f"{count} lines"] if count > FILE_LINES else []
     for node in ast.walk(tree):
@@ -242,7 +242,7 @@ def size_faults(tree, text):
         lines = node.end_lineno - node.lineno + 1
         if lines > FUNCTION_LINES:
             faults.append(f"{node.name}: {lines} lines")
-        names = [argument.arg for argument in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+        names = [argument.arg for argument in (*node.args.posonlyargs, *node.args.args)]
         taken = [name for name in names if name not in ("self", "cls")]
         if len(taken) > ARGUMENTS:
             faults.append(f"{node.name}: {len(taken)} arguments")

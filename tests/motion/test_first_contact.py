@@ -279,7 +279,7 @@ def test_sweeps(device, path):
         ({"end_poses": ends[:3]}, ValueError, "3 given for 1500"),
         ({"end_poses": np.where(np.arange(1500)[:, None] == 7, np.nan, ends)}, ValueError, "end_poses: pose 7"),
         ({}, TypeError, "end_poses"),
-        ({"end_poses": ends, "beyond": 1.0}, TypeError, "beyond"),
+        ({"end_poses": ends, "beyond": 1.0}, ValueError, "beyond"),
         ({"end_poses": ends, "tolerance": 2}, ValueError, "tolerance"),
     ):
         refused(error, message, ab.sweep, a, b, starts, **{**options, **bad})

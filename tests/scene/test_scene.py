@@ -9,7 +9,7 @@ from helpers.scenes import TURN, add_objects, everything, pair_scene, scene_with
 from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
-from warp_abtree.scene import scene as scene_module
+from warp_abtree.scene import posed_objects
 
 
 def placed(scene):
@@ -91,7 +91,7 @@ def test_an_interrupt_while_objects_are_added_leaves_no_trace(device, monkeypatc
     scene = pair_scene(device)
     before, models = everything(scene), [sample("torus"), sample("three")]
     with monkeypatch.context() as patch:
-        patch.setattr(scene_module, "check_lods", stop)
+        patch.setattr(posed_objects, "check_lods", stop)
         with pytest.raises(KeyboardInterrupt):
             scene.add_many(models, [STILL] * 2)
     assert everything(scene) == before and len(scene.models) == 2

@@ -134,13 +134,17 @@ class ScenePlayback(Playback):
         return self.loaded.motion.poses(self.time) if self._bodies is None else self._bodies.poses()
 
 
+NOWHERE = -2  # world of a place without an object
+
+
 class StillPlayback(Playback):
     """A scene that stands at its poses, by default those of now; LODs begin where they are, and are swept if told."""
 
     def __init__(self, scene: Scene, title: str, poses=None, sweep=None):
         self._held = PoseInput(scene).poses.numpy().copy() if poses is None else np.array(poses, np.float64)
         self._started, self._sweep = scene.lods, sweep
-        super().__init__(scene, title, scene.worlds, 1 / 30, MeshView())
+        worlds = np.where(scene.present, scene.worlds, NOWHERE)
+        super().__init__(scene, title, worlds, 1 / 30, MeshView())
 
     def _begin(self):
         self.scene.set_lods(self._started)

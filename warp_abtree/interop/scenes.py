@@ -140,7 +140,7 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
     objects = scene.batch().objects.pool
     worlds, rotation, position = objects.world.numpy(), objects.rotation.numpy(), objects.position.numpy()
     made = trimesh.Scene()
-    for i in range(count):
+    for i in np.flatnonzero(scene.present).tolist():
         if world is not None and worlds[i] not in (world, -1):
             continue
         model, lod = scene.models[scene.object_model[i]], int(scene.lods[i])

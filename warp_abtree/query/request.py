@@ -13,12 +13,11 @@ PRECISIONS = {"exact": predicates.EXACT, "float32": predicates.FLOAT32}
 
 _PRECISION_NAMES = tuple(PRECISIONS)  # found without a hash
 
-# Options that each output takes beside precision: in a scene, in a sweep, in a sweep of motions; and all of each.
+# Options that each output takes beside precision: in a scene, and in a sweep.
 _HITS, _DISTANCE = ("within",), ("tolerance", "relative", "beyond", "signed", "originals")
 SCENE_OPTIONS = {"any": _HITS, "count": _HITS, "faces": _HITS, "contacts": ("within", "gap"), "distance": _DISTANCE}
-SWEEP_OPTIONS = {"any": _HITS, "count": _HITS, "faces": (), "distance": _DISTANCE}
-MOTION_OPTIONS = {"first_contact": ("end_poses", "tolerance", "screw", "linear")}
-_KNOWN = {id(taken): frozenset(sum(taken.values(), ())) for taken in (SCENE_OPTIONS, SWEEP_OPTIONS, MOTION_OPTIONS)}
+_SWEPT = {"any": _HITS, "count": _HITS, "faces": (), "distance": _DISTANCE}
+SWEEP_OPTIONS = {**_SWEPT, "first_contact": ("end_poses", "tolerance", "screw", "linear")}
 
 # A launch of 32 threads a pair stays within 2^31.
 PAIRS_MAX = 2**26
@@ -90,19 +89,15 @@ def check_request(output: str, precision: str):
         raise ValueError(f"output {output!r} is found by ab.{others[output]}, or Scene.intersect")
 
 
-def check_options(caller: str, taken: dict, output: str, precision: str, options: dict) -> dict:
+def check_options(taken: dict, output: str, precision: str, options: dict) -> dict:
     """Return the options of an output that are neither None nor False.
 
     Args:
         taken: One of the tables above.
 
     Raises:
-        TypeError: An option that none of the outputs has.
         ValueError: An unknown output or precision, or an option that means nothing for this output.
     """
-    if not _KNOWN[id(taken)].issuperset(options):
-        asked = f" for output {output!r}" if len(taken) == 1 else ""
-        raise TypeError(f"{caller} has no option {min(set(options) - _KNOWN[id(taken)])!r}{asked}")
     given = {name: value for name, value in options.items() if value is not None and value is not False}
     if output not in taken:
         check_request(output, precision)

@@ -62,7 +62,7 @@ class KeptQueries:
 
     def find(self, pairs, output, precision, contact_dtype, options: dict, device: bool) -> Result:
         """Answer `Scene.intersect`."""
-        given = check_options("intersect", SCENE_OPTIONS, output, precision, options)
+        given = check_options(SCENE_OPTIONS, output, precision, options)
         tolerances, signed, of_originals = check_distance_options(given) if output == "distance" else ({}, False, False)
         distances = {name: to_numpy(given[name], name) for name in ("within", "gap", "beyond") if name in given}
         # One for all pairs widens the boxes of the broad phase.

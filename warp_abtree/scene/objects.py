@@ -16,7 +16,7 @@ ALL_BITS = 2**32 - 1
 
 @dataclass
 class ObjectList:
-    """The objects of a scene: `models` without repeats, and lists with an entry an object."""
+    """The objects of a scene: `models` without repeats, and lists with an entry a place."""
 
     models: list[Model] = field(default_factory=list)
     model: list[int] = field(default_factory=list)  # index into models
@@ -30,27 +30,67 @@ class ObjectList:
     mask: list[int] = field(default_factory=list)
     pose: list[np.ndarray] = field(default_factory=list)  # (7,) or (4, 4)
     place: dict[int, int] = field(default_factory=dict)  # index into models, by identity
+    free: list[int] = field(default_factory=list)  # places without an object, rising
+    hole: Model | None = None  # of these
 
     def __len__(self):
         return len(self.model)
 
-    def extend(self, models: list[Model], columns: dict[str, list]):
-        """Append objects, wholly or not at all: their models, and the other columns by name."""
-        count, known = len(self.model), len(self.models)
+    def extend(self, models: list[Model], columns: dict[str, list]) -> np.ndarray:
+        """Put objects into free places and append the rest, wholly or not at all; return their places.
+
+        Args:
+            models: Of the objects.
+            columns: The other lists by name, an entry an object.
+        """
+        count, known, taken = len(self), len(self.models), self.free[: len(models)]
+        before = {name: [getattr(self, name)[i] for i in taken] for name in ("model", *columns)}
         try:
             for model in models:
                 if id(model) not in self.place:
                     self.models.append(model)
                     self.place[id(model)] = len(self.models) - 1
-            for name, values in columns.items():
-                getattr(self, name).extend(values)
-            self.model.extend([self.place[id(model)] for model in models])
+            for name, values in (*columns.items(), ("model", [self.place[id(model)] for model in models])):
+                given = list(values)
+                self._write(name, taken, given[: len(taken)])
+                getattr(self, name).extend(given[len(taken) :])
         except BaseException:
-            for name in (*columns, "model"):
+            for name, values in before.items():
+                self._write(name, taken, values)
                 del getattr(self, name)[count:]
             del self.models[known:]
             self.place = {id(model): i for i, model in enumerate(self.models)}
             raise
+        if taken:
+            self.free = self.free[len(taken) :]
+            self._drop_models()
+        return np.array([*taken, *range(count, len(self))], np.int64)
+
+    def _write(self, name: str, places: list[int], values: list):
+        column = getattr(self, name)
+        for i, value in zip(places, values):
+            column[i] = value
+
+    def remove(self, places: list[int]):
+        """Take objects out of their places: what is left there is static, meets nothing, and has one triangle."""
+        if self.hole is None:
+            size = float(np.ptp(self.models[self.model[places[0]]].mesh_at(0)[0], axis=0).max())
+            self.hole = Model.from_arrays(np.eye(3) * size / 1024, np.array([[0, 1, 2]]), name="removed")
+        if id(self.hole) not in self.place:
+            self.models.append(self.hole)
+            self.place[id(self.hole)] = len(self.models) - 1
+        left = {"model": self.place[id(self.hole)], "lod": 0, "importance": 1, "static": True, "solid": False}
+        for name, value in {**left, "group": 0, "mask": 0, "name": None}.items():
+            self._write(name, places, [value] * len(places))
+        self.free = sorted([*self.free, *places])
+        self._drop_models()
+
+    def _drop_models(self):
+        """Forget models that no place has."""
+        used = sorted(set(self.model))
+        number = {old: new for new, old in enumerate(used)}
+        self.models, self.model = [self.models[k] for k in used], [number[k] for k in self.model]
+        self.place = {id(model): i for i, model in enumerate(self.models)}
 
     def collision_bits(self) -> np.ndarray:
         """Return collision group and mask of each object, uint32 (n, 2); (0, 2) where they keep no pair apart."""

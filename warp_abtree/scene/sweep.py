@@ -15,7 +15,7 @@ from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.base.arrays import NONE_REFUSED
 from warp_abtree.kernels.io.sweep import pose_placer, report_chunk_kernel
-from warp_abtree.query.request import MOTION_OPTIONS, SWEEP_OPTIONS, check_options, check_within, refuse_signed
+from warp_abtree.query.request import SWEEP_OPTIONS, check_options, check_within, refuse_signed
 from warp_abtree.query.stages.distance import DistanceQuery, check_beyond, check_distance_options
 from warp_abtree.query.stages.intersect import Query
 from warp_abtree.query.stages.motion import FirstContactQuery
@@ -258,29 +258,36 @@ def sweep(
     precision="exact",
     device=None,
     solid=False,
-    **options,
-):
+    *,
+    within=None,
+    tolerance=None,
+    relative=None,
+    beyond=None,
+    signed=None,
+    originals=None,
+    end_poses=None,
+    screw=None,
+    linear=None,
+) -> np.ndarray:
     """Test one pair of models at many poses of B in A's frame. Waits for the device, 1 to 3 times a chunk of 65,536.
 
-    Poses are checked on the device; on CUDA transfers overlap with launches, except for "faces". The arrays of the last
-    four pairs of models, LODs and devices stay on the device for the next call as long as both models live: some 190
-    bytes a face, and 0.5 KB for each of at most 74,752 poses. Calls of several threads take turns on a GPU.
+    Poses are checked on the device; on CUDA transfers overlap with launches, except for "faces". What the last four
+    pairs of models, LODs and devices need stays on the device while both models live: some 190 bytes a face, 0.5 KB for
+    each of at most 74,752 poses. Calls of several threads take turns on a GPU.
 
     Args:
         model_a, model_b: `Model`; may be the same.
         poses: (p, 7) x y z qx qy qz qw [model units of A, unit quaternions, normalised in float64], or rigid (p, 4, 4)
             matrices, taken as they are; float32 or float64, of any framework. What lies on the GPU that asks is read
             where it is, Warp's transforms and matrices (p,) too.
-        lod_a, lod_b: LODs; None is the finest.
+        lod_a, lod_b, device: LODs, None is the finest; and Warp device, None for Warp's default.
         output: "any", "count", "faces", "distance" or "first_contact", of B's motions from poses to end_poses.
         precision: As `Scene.intersect`, exact for A's vertices and the posed ones of B.
-        device: Warp device; None for Warp's default.
         solid: Whether both are solids (`Scene.add`), or a bool for each; what "any" and "distance" answer for one
             inside the other stands in `warp_abtree.state.solids`, "count" and "faces" are of surfaces.
-        options: tolerance, relative, beyond, each one number, and signed, as `DistanceQuery` takes them, and originals,
-            as `Scene.intersect` does; for "distance" alone. within, one distance as `Scene.intersect` takes it; for
-            "any" and "count" alone. end_poses, as poses, and tolerance, screw and linear, as `FirstContactQuery` takes
-            them; for "first_contact" alone.
+        within, relative, beyond, signed, originals: One value each, as `Scene.intersect` takes them.
+        tolerance: Of a "distance" as `DistanceQuery` takes it, of a "first_contact" as `FirstContactQuery` does.
+        end_poses, screw, linear: End poses as poses, the rest as `FirstContactQuery`; for "first_contact" alone.
 
     Returns:
         For "any" bool (p,), for "count" the intersecting face pairs of each pose, int64 (p,), for "faces" rows (pose,
@@ -290,10 +297,13 @@ def sweep(
         clear and undecided, see `query.stages.motion`.
 
     Raises:
-        TypeError: model_a or model_b is no Model; an option has another name.
-        ValueError: Bad poses, the first named, a LOD out of range, an unknown option or device, signed without a solid.
+        TypeError: model_a or model_b is no Model; a "first_contact" without end_poses.
+        ValueError: Bad poses, the first named, a LOD out of range, an option that means nothing for the output, an
+            unknown device, signed without a solid.
         RuntimeError: A graph is being captured.
     """
+    options = {"within": within, "tolerance": tolerance, "relative": relative, "beyond": beyond, "signed": signed}
+    options |= {"originals": originals, "end_poses": end_poses, "screw": screw, "linear": linear}
     options = _check_request(output, precision, options)
     pair = Scene(device)
     check_device(pair.device, "ab.sweep")
@@ -301,9 +311,8 @@ def sweep(
         poses = take_rows(poses, pair.device)
         if output == "first_contact":
             options["end_poses"] = take_ends(options["end_poses"], len(poses), pair.device)
-        solids = solid if isinstance(solid, tuple | list) and len(solid) == 2 else (solid, solid)
-        for model, lod, is_solid in zip((model_a, model_b), (lod_a, lod_b), solids):
-            pair.add(model, lod=lod, solid=is_solid)
+        for i, (model, lod) in enumerate([(model_a, lod_a), (model_b, lod_b)]):
+            pair.add(model, lod=lod, solid=solid[i] if isinstance(solid, tuple | list) and len(solid) == 2 else solid)
         refuse_signed(options.get("signed", False), any(pair.object_solid))
         if options.get("originals"):
             pair.set_lods([model.lod_max for model in (model_a, model_b)])
@@ -312,9 +321,8 @@ def sweep(
 
 def _check_request(output, precision, options) -> dict:
     """Return the options that are given, checked but for the poses."""
-    moves = output == "first_contact"
-    given = check_options("sweep", MOTION_OPTIONS if moves else SWEEP_OPTIONS, output, precision, options)
-    if moves:
+    given = check_options(SWEEP_OPTIONS, output, precision, options)
+    if output == "first_contact":
         if "end_poses" not in given:
             raise TypeError(f"sweep needs end_poses for output {output!r}")
         FirstContactQuery.plan(**{name: value for name, value in given.items() if name != "end_poses"})

@@ -28,9 +28,10 @@ class Batch(DeviceMemory):
         object_model: Model of each object, int (n,).
         excluded: Keys of pairs that the broad phase leaves out, see `exclusion_keys`.
         solid: Whether each object is a solid, (n,); empty for none.
+        removed: Indices that pairs may not name.
 
     Attributes:
-        models, states, objects, object_model, excluded: As given.
+        models, states, objects, object_model, excluded, removed: As given.
         solids: `SolidArrays`, None where no object is a solid.
         device: Of the arrays.
         filter_generation: `Generation` of the excluded pairs.
@@ -38,14 +39,21 @@ class Batch(DeviceMemory):
     """
 
     def __init__(
-        self, models: ModelArrays, states: StateArrays, objects: ObjectArrays, object_model, excluded=(), solid=()
+        self,
+        models: ModelArrays,
+        states: StateArrays,
+        objects: ObjectArrays,
+        object_model,
+        excluded=(),
+        solid=(),
+        removed=(),
     ):
         self.device = states.device
         self.models, self.states, self.objects = models, states, objects
         self.object_model = np.asarray(object_model)
         self._lods = np.full(len(self.object_model), -1, np.int64)
         self._followed: Any = None
-        self.excluded = np.asarray(excluded, np.int64)
+        self.excluded, self.removed = np.asarray(excluded, np.int64), list(removed)
         self.filter_generation = Generation(self.device)
         self.mean_faces = float(models.face_count[self.object_model].mean()) if len(self.object_model) else 1.0
         self.solids = SolidArrays(models, states, solid) if np.any(solid) else None
@@ -109,7 +117,7 @@ class Batch(DeviceMemory):
             wp.copy(objects.pool.position, placed.position)
         states = StateArrays(self.models, self.device)
         solid = () if self.solids is None else self.solids.is_solid
-        return Batch(self.models, states, objects, self.object_model, self.excluded, solid)
+        return Batch(self.models, states, objects, self.object_model, self.excluded, solid, self.removed)
 
     def add_finest(self, models):
         """Make a tree state of some more models at its finest LOD each, and point their objects at it."""
@@ -190,7 +198,9 @@ class Batch(DeviceMemory):
     def check(self, user: str):
         """Raise RuntimeError where the batch is no longer that of its scene; name its user, such as "query"."""
         if self._retired:
-            raise RuntimeError(f"objects were added to the scene since this {user} was made; make a new one")
+            raise RuntimeError(
+                f"objects were added to the scene, removed or changed since this {user} was made; make a new one"
+            )
         self.mend()
 
     def exclude(self, keys):
@@ -200,14 +210,14 @@ class Batch(DeviceMemory):
 
     def check_pairs(self, pairs) -> np.ndarray:
         """Return object pairs as int32 (p, 2), see `check_pairs`."""
-        return check_pairs(pairs, self.object_count)
+        return check_pairs(pairs, self.object_count, self.removed)
 
 
-def check_pairs(pairs, object_count: int) -> np.ndarray:
+def check_pairs(pairs, object_count: int, removed=()) -> np.ndarray:
     """Return object pairs as int32 (p, 2).
 
     Raises:
-        ValueError: Wrong shape, an index that is no object, an object paired with itself.
+        ValueError: Wrong shape, an index that is no object or of those removed, an object paired with itself.
     """
     pairs = to_numpy(pairs, "pairs")
     if pairs.shape in ((0,), (0, 2)):
@@ -224,6 +234,10 @@ def check_pairs(pairs, object_count: int) -> np.ndarray:
     if same.any():
         first = int(same.argmax())
         raise ValueError(f"pairs: pair {first} pairs object {pairs[first, 0]} with itself")
+    if removed:
+        gone = np.isin(pairs, removed)
+        if gone.any():
+            raise ValueError(f"pairs: pair {gone.any(1).argmax()} names object {pairs[gone][0]}, which was removed")
     return pairs.astype(np.int32, order="C")
 
 

@@ -14,8 +14,8 @@ NOT_LAUNCHED, INTERRUPTED = -1, -3
 SUSPENDED = -1
 
 STALE_GRAPH = (
-    "was captured before arrays that it uses were replaced (objects were added, LODs took more tree states, pairs were "
-    "filtered out, an update of LODs was interrupted, or a buffer grew); capture it again"
+    "was captured before arrays that it uses were replaced (objects were added, removed or changed, LODs took more "
+    "tree states, pairs were filtered out, an update of LODs was interrupted, or a buffer grew); capture it again"
 )
 
 

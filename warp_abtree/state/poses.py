@@ -152,3 +152,10 @@ class HostPoses:
 def launch_place(rows, pool):
     """Set the objects of a pool from sound rows of 7 or 16 numbers. One launch: all objects move, or none."""
     wp.launch(place_poses.pose_setter(rows.dtype, rows.shape[1]), len(rows), [rows, pool], device=rows.device)
+
+
+def place_row(pose: np.ndarray, pool, i: int):
+    """Set object i of a pool from a checked pose, (1, 7) or (1, 4, 4)."""
+    one = type(pool)()
+    one.rotation, one.position = pool.rotation[i : i + 1], pool.position[i : i + 1]
+    launch_place(wp.array(pose.reshape(1, -1), dtype=wp.float64, device=pool.position.device), one)

@@ -22,7 +22,7 @@ def make_surroundings(world, device) -> tuple[Scene | None, tuple]:
     if isinstance(world, Scene):
         if world.device != device:
             raise ValueError(f"world: a scene on {world.device}, the robot is on {device}")
-        if len(set(world.worlds.tolist()) - {-1}) > 1:
+        if len(set(world.worlds[world.present].tolist()) - {-1}) > 1:
             raise ValueError("world: a scene of several worlds; a robot is in one")
         return (world, (id(world),)) if world.object_count else (None, ())
     listed = [] if world is None else [world] if isinstance(world, Model) else world

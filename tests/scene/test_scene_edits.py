@@ -1,0 +1,150 @@
+"""Editing a scene: names, poses of one object, objects removed and changed; what is left is a scene made anew."""
+
+import numpy as np
+import pytest
+from helpers import refused
+from helpers.samples import STILL, random_poses, sample
+from helpers.scenes import TURN, everything, pair_scene
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import warp_abtree as ab
+from warp_abtree.model.mesh import MeshError
+
+MODELS = ("small ball", "box", "torus", "twins")
+FLAGS = {"static": st.booleans(), "collision_group": st.integers(0, 3), "collision_mask": st.integers(0, 3)}
+CHANGES = st.fixed_dictionaries({}, optional={**FLAGS, "world": st.integers(-1, 1), "name": st.sampled_from("xyz")})
+
+
+def answers(scene):
+    """Return what a scene answers about pairs of its objects, by their numbers among those that are there."""
+    number = np.cumsum(scene.present) - 1
+    pairs = scene.broad_phase()
+    found = scene.intersect(pairs, output="count")
+    objects = np.flatnonzero(scene.present).tolist()
+    names = [scene.name(i) for i in objects if not scene.name(i).endswith(f" {i}")]
+    return number[pairs].tolist(), found.count.tolist(), scene.lods[objects].tolist(), names
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_an_edited_scene_is_one_made_anew(device, data):
+    """After any adds, removals and changes, but for the order of objects, which are told apart by their poses."""
+    rng = np.random.default_rng(data.draw(st.integers(0, 99)))
+    scene, told = ab.Scene(device), {}
+    for _ in range(data.draw(st.integers(3, 12))):
+        act = data.draw(st.sampled_from(["add", "add", "add", "remove", "change", "pose", "ask"]))
+        i = data.draw(st.sampled_from(sorted(told))) if told else None
+        if act == "add" or i is None:
+            model, pose = sample(data.draw(st.sampled_from(MODELS))), random_poses(rng, 1, 0.5)[0]
+            place = scene.add(model, pose, lod=3)
+            assert place == min(set(range(scene.object_count + 1)) - set(told))
+            told[place] = {"model": model, "pose": pose, "lod": 3}
+        elif act == "remove":
+            scene.remove(i)
+            del told[i]
+        elif act == "change":
+            change = data.draw(CHANGES)
+            scene.change(i, **change)
+            told[i] |= change
+        elif act == "pose":
+            told[i]["pose"] = random_poses(rng, 1, 0.5)[0]
+            scene.set_pose(i, told[i]["pose"])
+        else:
+            scene.broad_phase()
+    fresh = ab.Scene(device)
+    for i in sorted(told):
+        fresh.add(**told[i])
+    assert np.flatnonzero(scene.present).tolist() == sorted(told)
+    if told:
+        assert answers(scene) == answers(fresh)
+        assert np.array_equal(scene.poses[scene.present], fresh.poses)
+        used = {id(each["model"]) for each in told.values()}
+        assert {id(model) for model in scene.models if model.name != "removed"} == used
+
+
+@pytest.mark.parametrize("pose", [random_poses(np.random.default_rng(2), 1, 2.0)[0], TURN])
+def test_one_pose_is_set_as_all_are(device, pose):
+    scenes = [pair_scene(device), pair_scene(device)]
+    assert len(scenes[0].broad_phase()) == 2
+    scenes[0].set_pose(1, pose)
+    rows = [pose if i == 1 else row for i, row in enumerate(pair_scene(device).poses)]
+    if np.ndim(pose) == 2:
+        rows = [row if i == 1 else np.eye(4) for i, row in enumerate(rows)]
+        for i, y in ((0, 0.0), (2, 0.5)):
+            rows[i][1, 3] = y
+    scenes[1].set_poses(np.array(rows))
+    assert everything(scenes[0]) == everything(scenes[1])
+    assert np.array_equal(scenes[0].broad_phase(), scenes[1].broad_phase())
+
+
+def test_poses_are_read_back(device):
+    """To rounding, with qw of 0 or more, whether objects have been used or not, and after what else changes."""
+    poses = random_poses(np.random.default_rng(4), 5, 3.0)
+    scene = ab.Scene(device)
+    assert scene.poses.shape == (0, 7)
+    scene.add_many(sample("box"), poses)
+    poses *= np.where(poses[:, 6:] < 0, [1, 1, 1, -1, -1, -1, -1], 1)
+    np.testing.assert_allclose(scene.poses, poses, rtol=0, atol=1e-15)
+    scene.remove([1, 3])
+    np.testing.assert_allclose(scene.poses, poses, rtol=0, atol=1e-15)
+
+
+def test_what_is_removed_is_nowhere(device):
+    scene = pair_scene(device)
+    query = ab.Query(scene, "any", pairs=[(1, 2)])
+    scene.remove(1)
+    refused(RuntimeError, "removed", query.launch)
+    assert scene.object_count == 3 and scene.present.tolist() == [True, False, True]
+    before = everything(scene)
+    for call, *arguments in (
+        (scene.intersect, [(0, 2), (2, 1)]),
+        (scene.first_contact, [(1, 0)], scene.poses),
+        (scene.filter, [(1, 0)]),
+        (scene.set_pose, 1, STILL),
+        (scene.name, 1),
+        (scene.tree_state, 1),
+        (scene.remove, [0, 1]),
+        (scene.change, 1, 0),
+    ):
+        refused(ValueError, "object 1.* removed", call, *arguments)
+    refused(ValueError, "twice", scene.remove, [0, 0])
+    refused(ValueError, "outside 0 .. 2", scene.remove, [0, 3])
+    assert everything(scene) == before
+    assert list(ab.to_trimesh(scene).graph.nodes_geometry) == ["object 0", "object 2"]
+    # The filter of objects 0 and 1 went with object 1.
+    assert scene.add(sample("box"), (0.5, 0.25, 0, 0, 0, 0, 1)) == 1
+    assert [0, 1] in scene.broad_phase().tolist()
+
+
+def test_a_scene_may_lose_all_objects(device):
+    scene = ab.Scene(device)
+    scene.add_many(sample("box"), [STILL] * 2)
+    scene.remove([1, 0])
+    assert len(scene.broad_phase()) == 0 and not scene.present.any()
+    assert scene.add_many(sample("torus"), [STILL] * 3).tolist() == [0, 1, 2]
+    assert scene.models == [sample("torus")] and len(scene.broad_phase()) == 3
+
+
+def test_changes_are_those_of_add_and_leave_the_rest(device):
+    scene = pair_scene(device)
+    scene.change(1, world=3, importance=2, name="bolt 7")
+    assert (scene.worlds[1], scene.object_importance[1], scene.name(1)) == (3, 2, "bolt 7")
+    assert scene.name(0) == "small ball 0" and scene.object_solid == [False] * 3
+    scene.change(0, solid=True)
+    scene.change(1, importance=3)
+    assert scene.object_solid[0] and scene.name(1) == "bolt 7"
+    scene.add(sample("soup"))
+    before = everything(scene)
+    refused(MeshError, "closed", scene.change, 3, solid=True, importance=2)
+    refused(ValueError, "importance", scene.change, 0, importance=4, world=1)
+    refused(ValueError, "name", scene.change, 0, name="")
+    refused(ValueError, "name", scene.add, sample("box"), name=7)
+    refused(ValueError, "names: 1 given for 2", scene.add_many, sample("box"), [STILL] * 2, names=["a"])
+    assert everything(scene) == before and scene.object_importance == [1, 3, 1, 1]
+    # A new name leaves queries as they are.
+    query = ab.Query(scene, "any", pairs=[(0, 1)])
+    scene.change(0, name="nut")
+    query.launch()
+    scene.change(0, static=True)
+    refused(RuntimeError, "changed", query.launch)
