@@ -247,14 +247,14 @@ def test_rule_of_kernel_imports_catches(source):
     "source",
     [
         "x = 1\n" * 401,
-        "def f():\n" + "    pass\n" * 60,
+        "def f():\n" + "    pass\n" * 61,
         f"def f(self, {', '.join(f'a{i}' for i in range(11))}):\n    pass",
     ],
 )
 def test_rule_of_sizes_catches(source):
     assert size_faults(parse(source), source)
     named = ", ".join(f"a{i}" for i in range(11))
-    fine = "x = 1\n" * 330 + f"def f(*, {named}):\n" + "    pass\n" * 59
+    fine = "x = 1\n" * 330 + f"def f(*, {named}):\n" + "    pass\n" * 60
     assert not size_faults(parse(fine), fine)
 
 
