@@ -1,5 +1,7 @@
 """Editing a scene: names, poses of one object, objects removed and changed; what is left is a scene made anew."""
 
+import csv
+
 import numpy as np
 import pytest
 from helpers import refused
@@ -148,3 +150,29 @@ def test_changes_are_those_of_add_and_leave_the_rest(device):
     query.launch()
     scene.change(0, static=True)
     refused(RuntimeError, "changed", query.launch)
+
+
+def test_results_are_rows_with_names(device, tmp_path):
+    """Of every output, from host and device alike, and also once what they were about has changed."""
+    scene, pairs, names = pair_scene(device), [(1, 2), (0, 1)], ["small ball 0", "nut, M20", "small ball 2"]
+    scene.change(1, name=names[1])
+    for output in ("any", "contacts", "distance", "first_contact"):
+        ask = scene.first_contact if output == "first_contact" else scene.intersect
+        first, last = ask(pairs, scene.poses if output == "first_contact" else output), None
+        last = ask(pairs, scene.poses if output == "first_contact" else output, device=True)
+        rows = first.rows()
+        scene.change(1, name="other")
+        assert rows == first.rows() == last.rows()
+        scene.change(1, name=names[1])
+        assert [(row["first"], row["second"]) for row in rows] == [(names[i], names[j]) for i, j in pairs]
+        for name in ("any", "distance", "points", "clear", "count"):
+            values = getattr(first, name)
+            assert [row.get(name) for row in rows] == ([None] * 2 if values is None else values.tolist())
+        first.to_csv(tmp_path / "rows.csv")
+        with open(tmp_path / "rows.csv", newline="", encoding="utf-8") as file:
+            table = list(csv.DictReader(file))
+        assert [row["first"] for row in table] == [row["first"] for row in rows]
+        if output == "contacts":
+            point = [[float(row[f"point_{axis}"]) for axis in "xyz"] for row in table]
+            np.testing.assert_array_equal(point, first.pair_contacts["point"])
+    assert scene.intersect([], "any").rows() == []

@@ -113,7 +113,7 @@ class Readout:
             operator.guard.check(found.totals.launched)
         for read in operator.readers:
             read(found, device, with_rows)
-        return Result(found, operator.rooms, operator.output)
+        return Result(found, operator.rooms, operator.output, operator.batch.names)
 
     def read_totals(self) -> Totals:
         """Read what the last launch needed of each list. Waits for the device."""

@@ -1,11 +1,13 @@
 """Results of queries."""
 
+import csv
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.query.request import CapacityError
 
@@ -116,6 +118,7 @@ class Result(DeviceMemory):
         found: What was read.
         room: What there was room for, (pairs, hits, uncertain face pairs).
         output: That of the query.
+        names: Of the objects, or none.
     """
 
     # Any: who asked for them knows that they are not None.
@@ -137,13 +140,13 @@ class Result(DeviceMemory):
     float64_tests: Any
     exact_tests: Any
 
-    def __init__(self, found: Found, room: tuple, output: str):
+    def __init__(self, found: Found, room: tuple, output: str, names=()):
         for name in RESULT_ARRAYS:
             setattr(self, name, getattr(found, name))
         self.count: Any = found.count if output != "any" else None
         for name in COUNTERS:
             setattr(self, name, found.tests[name])
-        self._totals, self._room = found.totals, room
+        self._totals, self._room, self._names = found.totals, room, names
 
     def __repr__(self):
         held = [name for name in (*RESULT_ARRAYS[1:], "count") if getattr(self, name) is not None]
@@ -179,3 +182,54 @@ class Result(DeviceMemory):
                 raise CapacityError(
                     f"{demand} {what}, the query has room for {room}: make it with capacity=Buffers({name}={demand})"
                 )
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a dict a pair: names of its objects, "first" and "second", and its answers. Waits for the device.
+
+        Answers are Python's numbers and lists, by the names of the result's arrays and of `pair_contacts`; what has an
+        entry a face pair or contact point is left out.
+        """
+        pairs = _to_host(self.pairs)
+        columns = {name: [self._name(i) for i in pairs[:, k].tolist()] for k, name in enumerate(("first", "second"))}
+        columns |= {name: _to_host(values).tolist() for name, values in self._pair_arrays()}
+        return [dict(zip(columns, row)) for row in zip(*columns.values())]
+
+    def _pair_arrays(self):
+        """Yield names and arrays of what has an entry a pair, on either side."""
+        for name in ("any", "count", "apart", *DISTANCES, "points", *TIMES):
+            values = getattr(self, name)
+            if values is not None and not isinstance(values, dict):  # of contact points, which no pair has one of
+                yield name, values
+        summary = self.pair_contacts
+        if summary is not None:
+            names = summary if isinstance(summary, dict) else summary.dtype.names
+            yield from ((name, summary[name]) for name in names if name != "count")
+
+    def _name(self, i: int) -> str:
+        return self._names[i] if i < len(self._names) else f"object {i}"
+
+    def to_csv(self, path):
+        """Write `rows` as a table: vectors in columns of their own, as point_x, bracket_0. Waits for the device.
+
+        Raises:
+            OSError: The file cannot be written; one that stood there stays.
+        """
+        rows = [dict(_split(row)) for row in self.rows()]
+        with atomic_write(path, "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(rows[0]) if rows else ["first", "second"])
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+def _to_host(values) -> np.ndarray:
+    return values if isinstance(values, np.ndarray) else values.numpy()
+
+
+def _split(values):
+    """Yield names and numbers of a row: those of a vector by axis, of another list by place."""
+    for name, value in values.items():
+        if isinstance(value, list):
+            ends = "xyz" if len(value) == 3 else range(len(value))
+            yield from _split({f"{name}_{end}": part for end, part in zip(ends, value)})
+        else:
+            yield name, value

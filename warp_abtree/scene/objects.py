@@ -20,7 +20,7 @@ class ObjectList:
 
     models: list[Model] = field(default_factory=list)
     model: list[int] = field(default_factory=list)  # index into models
-    name: list[str | None] = field(default_factory=list)
+    name: list[str] = field(default_factory=list)  # another list where one changes: results keep what they had
     world: list[int] = field(default_factory=list)
     lod: list[int] = field(default_factory=list)
     importance: list[int] = field(default_factory=list)
@@ -44,6 +44,9 @@ class ObjectList:
             columns: The other lists by name, an entry an object.
         """
         count, known, taken = len(self), len(self.models), self.free[: len(models)]
+        places = [*taken, *range(count, count + len(models) - len(taken))]
+        told = zip(columns["name"], models, places)
+        columns["name"] = [f"{model.name} {i}" if name is None else name for name, model, i in told]
         before = {name: [getattr(self, name)[i] for i in taken] for name in ("model", *columns)}
         try:
             for model in models:
@@ -64,12 +67,19 @@ class ObjectList:
         if taken:
             self.free = self.free[len(taken) :]
             self._drop_models()
-        return np.array([*taken, *range(count, len(self))], np.int64)
+        return np.array(places, np.int64)
 
     def _write(self, name: str, places: list[int], values: list):
+        if name == "name" and places:
+            self.name = list(self.name)
         column = getattr(self, name)
         for i, value in zip(places, values):
             column[i] = value
+
+    def change(self, i: int, columns: dict[str, list]):
+        """Change lists at one place."""
+        for name, values in columns.items():
+            self._write(name, [i], values)
 
     def remove(self, places: list[int]):
         """Take objects out of their places: what is left there is static, meets nothing, and has one triangle."""
@@ -80,7 +90,7 @@ class ObjectList:
             self.models.append(self.hole)
             self.place[id(self.hole)] = len(self.models) - 1
         left = {"model": self.place[id(self.hole)], "lod": 0, "importance": 1, "static": True, "solid": False}
-        for name, value in {**left, "group": 0, "mask": 0, "name": None}.items():
+        for name, value in {**left, "group": 0, "mask": 0, "name": "removed"}.items():
             self._write(name, places, [value] * len(places))
         self.free = sorted([*self.free, *places])
         self._drop_models()

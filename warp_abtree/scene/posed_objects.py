@@ -90,9 +90,7 @@ class PosedObjects(DeviceMemory):
         Raises:
             ValueError: No such object.
         """
-        i = self._check_object(i)
-        told = self._objects.name[i]
-        return f"{self.models[self.object_model[i]].name} {i}" if told is None else told
+        return self._objects.name[self._check_object(i)]
 
     def add(
         self,
@@ -220,8 +218,9 @@ class PosedObjects(DeviceMemory):
         )
         if {key for key, value in given.items() if value is not None} - {"name"}:
             self._retire("changing an object")
-        for key, (value,) in columns.items():
-            getattr(told, key)[i] = value
+        told.change(i, columns)
+        if self._batch is not None:
+            self._batch.names = told.name
 
     def _check_object(self, i) -> int:
         i = whole_number(i, "object", 0, self.object_count - 1)
@@ -259,7 +258,7 @@ class PosedObjects(DeviceMemory):
             states = StateArrays(models, self.device)
             told = self._objects
             objects = ObjectArrays(told.world, told.static, self.device, told.collision_bits())
-            batch = Batch(models, states, objects, told.model, self._excluded, told.solid, told.free)
+            batch = Batch(models, states, objects, told.model, self._excluded, told.solid, told.free, told.name)
             batch.set_lods(np.array(told.lod))
             told.set_poses(objects.pool, self.device)
             self._batch = batch

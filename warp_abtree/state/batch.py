@@ -29,9 +29,10 @@ class Batch(DeviceMemory):
         excluded: Keys of pairs that the broad phase leaves out, see `exclusion_keys`.
         solid: Whether each object is a solid, (n,); empty for none.
         removed: Indices that pairs may not name.
+        names: Of the objects, or none.
 
     Attributes:
-        models, states, objects, object_model, excluded, removed: As given.
+        models, states, objects, object_model, excluded, removed, names: As given.
         solids: `SolidArrays`, None where no object is a solid.
         device: Of the arrays.
         filter_generation: `Generation` of the excluded pairs.
@@ -47,13 +48,14 @@ class Batch(DeviceMemory):
         excluded=(),
         solid=(),
         removed=(),
+        names=(),
     ):
         self.device = states.device
         self.models, self.states, self.objects = models, states, objects
         self.object_model = np.asarray(object_model)
         self._lods = np.full(len(self.object_model), -1, np.int64)
         self._followed: Any = None
-        self.excluded, self.removed = np.asarray(excluded, np.int64), list(removed)
+        self.excluded, self.removed, self.names = np.asarray(excluded, np.int64), list(removed), names
         self.filter_generation = Generation(self.device)
         self.mean_faces = float(models.face_count[self.object_model].mean()) if len(self.object_model) else 1.0
         self.solids = SolidArrays(models, states, solid) if np.any(solid) else None
@@ -117,7 +119,7 @@ class Batch(DeviceMemory):
             wp.copy(objects.pool.position, placed.position)
         states = StateArrays(self.models, self.device)
         solid = () if self.solids is None else self.solids.is_solid
-        return Batch(self.models, states, objects, self.object_model, self.excluded, solid, self.removed)
+        return Batch(self.models, states, objects, self.object_model, self.excluded, solid, self.removed, self.names)
 
     def add_finest(self, models):
         """Make a tree state of some more models at its finest LOD each, and point their objects at it."""
