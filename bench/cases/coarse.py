@@ -18,7 +18,8 @@ FRACTIONS = (1.0, 0.1, 0.01)  # of the faces
 def run(device, quick=False):
     """Yield one row a number of pairs, distance and LOD: times of launches of each output and of the baseline.
 
-    faces are those active at the LOD; ratios are the baseline's times over ours, contact_ratio contacts over faces.
+    faces are those active at the LOD; ratios are the baseline's times over ours, contact_ratio contacts over faces;
+    hit_ns is the time of all face pairs for each that is found.
     """
     device = wp.get_device(device)
     sizes = QUICK if quick else KNOT_PAIRS
@@ -51,4 +52,5 @@ def run_batch(device, model, fraction, poses, repeats):
     row = {"faces": len(mesh[1]), "hits": hits, "node_tests": found["faces"].node_tests.sum()}
     row |= {"peer": f"wp.Bvh {baseline.constructor}"} | summarise(times)
     row |= {f"{output}_ratio": ratio_of(times[f"peer_{output}"], times[output]) for output in ("faces", "any")}
+    row["hit_ns"] = 1e6 * row["faces_ms"] / max(hits, 1)
     return row | {"contact_ratio": ratio_of(times["contacts"], times["faces"])}
