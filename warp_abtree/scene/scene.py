@@ -10,6 +10,7 @@ from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.result import Result, contact_dtypes
 from warp_abtree.scene.kept_queries import KeptQueries
 from warp_abtree.scene.objects import ALL_BITS, ObjectList, check_columns, check_lods, check_models
+from warp_abtree.scene.penetration import Penetration, find_penetration
 from warp_abtree.scene.tree_state import TreeState, read_tree_state
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.batch import Batch, check_pairs, exclusion_keys
@@ -365,6 +366,24 @@ class Scene(DeviceMemory):
         if pairs is not None:
             pairs = check_pairs(pairs, self.object_count)
         return self._queries.find_first_contacts(pairs, end_poses, tolerance, screw, linear, device)
+
+    def penetration(self, pairs=None, directions=None, tolerance=1e-6) -> Penetration:
+        """Find the least way out of object pairs along directions, certified by first contacts. Waits for the device.
+
+        Args:
+            pairs: As for `intersect`.
+            directions: In which the second objects may leave, world axes, of any length: (m, 3), or (p, m, 3) for each
+                pair; None for both ways along the mean normal of the contacts and the axes of the smaller object's box,
+                and the axes and diagonals of a cube.
+            tolerance: What a depth may be too long by, as a part of both boxes' sizes along its direction, from 2^-40.
+
+        Returns:
+            `Penetration` with pairs, depth and direction; what they promise stands in `scene.penetration`.
+
+        Raises:
+            ValueError: Bad pairs or tolerance, a scene without objects, a direction that is 0 or not finite.
+        """
+        return find_penetration(self, pairs, directions, tolerance)
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.
