@@ -25,7 +25,7 @@ APPROACHES = 65536
 # What starts are farther away than boxes reach, as a part of their sizes.
 START_MARGIN = 2.0**-10
 # Of lengths and positions in float64, each rounded a few times.
-ROUNDING = 2.0**-50
+POSITION_ROUNDING = 2.0**-50
 # Axes, edge and corner diagonals of a cube.
 CUBE_DIRECTIONS = np.array([d for d in product((1, 0, -1), repeat=3) if any(d)], np.float64)
 DEFAULT_COUNT = 2 + 6 + len(CUBE_DIRECTIONS)
@@ -151,7 +151,7 @@ class _Approaches:
         query = FirstContactQuery(own, None, pairs, tolerance=tolerance)
         query.ends.position.assign(position)
         rest = way * (1 - query.run().time)
-        return rest + ROUNDING * (way + np.abs(position[pairs[:, 1]]).max(1)) * (rest > 0)
+        return rest + POSITION_ROUNDING * (way + np.abs(position[pairs[:, 1]]).max(1)) * (rest > 0)
 
     def find_least(self, likely: int, tolerance) -> tuple:
         """Return the least depth of each pair and its direction, (p,) and (p, 3). Waits for the device.
