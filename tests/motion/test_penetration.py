@@ -16,6 +16,7 @@ from oracles.motion import posed
 from oracles.penetration import convex_exits, last_touch
 
 import warp_abtree as ab
+from warp_abtree import testing
 from warp_abtree.scene import penetration
 
 FINE = 2.0**-40  # tolerance
@@ -171,7 +172,7 @@ def test_free_there_and_not_before(device, seed, names):
 
 
 @pytest.mark.parametrize("directions", [None, np.eye(3)])
-def test_the_scene_stays_and_chunks_agree(device, monkeypatch, directions):
+def test_the_scene_stays_and_chunks_and_regimes_agree(device, monkeypatch, directions):
     rng = np.random.default_rng(5)
     cases = [random_case(rng, ("torus", "small ball"), 60) for _ in range(20)]
     scene, pairs = scene_of(device, cases), pairs_of(cases)
@@ -182,11 +183,12 @@ def test_the_scene_stays_and_chunks_agree(device, monkeypatch, directions):
     query.hits.count.zero_()
     replay()
     np.testing.assert_array_equal(query.result().count, counts)
-    for room in (1, 100):
+    for room, warps in ((1, None), (100, None), (penetration.APPROACHES, True)):
         monkeypatch.setattr(penetration, "APPROACHES", room)
-        chunks = scene.penetration(pairs, directions)
-        np.testing.assert_array_equal(chunks.depth, whole.depth)
-        np.testing.assert_array_equal(chunks.direction, whole.direction)
+        with testing.regime(warps=warps):
+            other = scene_of(device, cases).penetration(pairs, directions)
+        np.testing.assert_array_equal(other.depth, whole.depth)
+        np.testing.assert_array_equal(other.direction, whole.direction)
 
 
 def test_bad_input(device):

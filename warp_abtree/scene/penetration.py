@@ -6,7 +6,9 @@ along d, the surfaces do not interpenetrate. It is too long by at most `toleranc
 boxes are along d; by more where `FirstContactQuery` leaves a pair undecided. That holds for motions as real numbers; a
 pose that is moved so rounds.
 
-The least depth over the directions bounds the translational penetration depth of the pair from above.
+The least depth over the directions bounds the translational penetration depth of the pair from above. Directions are
+those given, or both ways along the mean normal of the contacts and the axes of the smaller object's box, and the axes,
+edge and corner diagonals of a cube in the world.
 """
 
 from dataclasses import dataclass
@@ -164,8 +166,10 @@ class _Approaches:
             asked[rows, some.argmin(1)] = True
         depths[asked] = self.find_depths(asked, tolerance)
         left = ~asked
-        left[left] = ~self.meet(left, np.broadcast_to(depths.min(1)[:, None], left.shape)[left])
-        depths[left] = self.find_depths(left, tolerance)
+        if left.any():
+            left[left] = ~self.meet(left, np.broadcast_to(depths.min(1)[:, None], left.shape)[left])
+        if left.any():
+            depths[left] = self.find_depths(left, tolerance)
         least = rows, depths.argmin(1)
         return depths[least], self._directions[least]
 

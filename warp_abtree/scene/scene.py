@@ -368,20 +368,16 @@ class Scene(DeviceMemory):
         return self._queries.find_first_contacts(pairs, end_poses, tolerance, screw, linear, device)
 
     def penetration(self, pairs=None, directions=None, tolerance=1e-6) -> Penetration:
-        """Find the least way out of object pairs along directions, certified by first contacts. Waits for the device.
+        """Find the least way out of object pairs, certified by first contacts. Waits for the device.
 
         Args:
             pairs: As for `intersect`.
-            directions: In which the second objects may leave, world axes, of any length: (m, 3), or (p, m, 3) for each
-                pair; None for both ways along the mean normal of the contacts and the axes of the smaller object's box,
-                and the axes and diagonals of a cube.
+            directions: In which the second objects may leave, world axes, of any length, (m, 3) or (p, m, 3); None for
+                those of `scene.penetration`, where all else stands too.
             tolerance: What a depth may be too long by, as a part of both boxes' sizes along its direction, from 2^-40.
 
-        Returns:
-            `Penetration` with pairs, depth and direction; what they promise stands in `scene.penetration`.
-
         Raises:
-            ValueError: Bad pairs or tolerance, a scene without objects, a direction that is 0 or not finite.
+            ValueError: Bad pairs or tolerance, no object, a direction that is 0 or not finite.
         """
         return find_penetration(self, pairs, directions, tolerance)
 
