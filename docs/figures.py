@@ -245,6 +245,24 @@ def draw_when():
     draw(panels, FOLDER / "sample_when.png", "First contacts", legend, (0.5, -1, 0.45), (0, 0, 1), 330)
 
 
+def draw_way_out():
+    """A pin through a plate, and where it is free."""
+    scene = ab.Scene("cpu")
+    for sizes in ((12, 12, 1), (1, 1, 10)):
+        scene.add(ab.Model.load(trimesh.creation.box(sizes)), solid=True)
+    start = np.array([(0, 0, 0, 0, 0, 0, 1), (3, 0, 0, 0, 0, 0, 1.0)])
+    scene.set_poses(start)
+    deepest = scene.intersect([(0, 1)], "distance", signed=True).distance[0]
+    panels = [panel_of(scene, f"as posed: signed distance {deepest:.3g}", start, query=False)]
+    for directions, title in ((None, "the least way out"), ([(0, 0, 1)], "the way out upwards")):
+        scene.set_poses(start)
+        way, end = scene.penetration([(0, 1)], directions), start.copy()
+        end[1, :3] += way.depth[0] * way.direction[0]
+        panels.append(panel_of(scene, f"{title}: {way.depth[0]:.3g}", end, query=False))
+    legend = [(COLOURS[0][0], "plate"), (COLOURS[1][0], "pin")]
+    draw(panels, FOLDER / "sample_way_out.png", "A pin through a plate", legend, (0.5, -1, 0.45), (0, 0, 1), 330)
+
+
 def draw_which_lod():
     sample = run_sample("04_which_lod")
     model, half = sample["model"], 0.5**0.5
@@ -277,6 +295,7 @@ def main():
     draw_which_pairs()
     draw_how_far()
     draw_when()
+    draw_way_out()
     draw_which_lod()
     draw_simulator()
 

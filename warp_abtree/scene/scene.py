@@ -6,6 +6,7 @@ from warp_abtree.checks.arguments import check_device, flag, to_numpy
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.result import Result, contact_dtypes
 from warp_abtree.scene.kept_queries import KeptQueries
+from warp_abtree.scene.penetration import Penetration, find_penetration
 from warp_abtree.scene.posed_objects import PosedObjects
 from warp_abtree.scene.tree_state import TreeState, read_tree_state
 from warp_abtree.state.batch import check_pairs, exclusion_keys
@@ -152,6 +153,20 @@ class Scene(PosedObjects):
         if pairs is not None:
             pairs = self._check_pairs(pairs)
         return self._queries.find_first_contacts(pairs, end_poses, tolerance, screw, linear, device)
+
+    def penetration(self, pairs=None, directions=None, tolerance=1e-6) -> Penetration:
+        """Find the least way out of object pairs, certified by first contacts. Waits for the device.
+
+        Args:
+            pairs: As for `intersect`.
+            directions: In which the second objects may leave, world axes, of any length, (m, 3) or (p, m, 3); None for
+                those of `scene.penetration`, where all else stands too.
+            tolerance: What a depth may be too long by, as a part of both boxes' sizes along its direction, from 2^-40.
+
+        Raises:
+            ValueError: Bad pairs or tolerance, no object, a direction that is 0 or not finite.
+        """
+        return find_penetration(self, pairs, directions, tolerance)
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.
