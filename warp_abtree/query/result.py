@@ -141,11 +141,9 @@ class Result(DeviceMemory):
     exact_tests: Any
 
     def __init__(self, found: Found, room: tuple, output: str, names=()):
-        for name in RESULT_ARRAYS:
-            setattr(self, name, getattr(found, name))
+        held = vars(found)
+        vars(self).update({name: held[name] for name in RESULT_ARRAYS}, **found.tests)
         self.count: Any = found.count if output != "any" else None
-        for name in COUNTERS:
-            setattr(self, name, found.tests[name])
         self._totals, self._room, self._names = found.totals, room, names
 
     def __repr__(self):

@@ -56,7 +56,9 @@ class Scene(PosedObjects):
 
     @property
     def _queries(self) -> KeptQueries:
-        return self._kept.setdefault("queries", KeptQueries(self, self._find_pairs))
+        if "queries" not in self._kept:
+            self._kept["queries"] = KeptQueries(self, self._find_pairs)
+        return self._kept["queries"]
 
     def _find_pairs(self, pairs, within: float) -> np.ndarray:
         """Return given pairs, checked, or those of the broad phase up to a distance."""
