@@ -144,7 +144,7 @@ def run_frames(loaded, frames, budget):
     bodies = loaded.make_bodies()
     motion = loaded.motion if bodies is None else bodies.motion(loaded.motion)
     lods = None if budget is None else ab.PredictiveController(scene, budget, loaded.camera)
-    frame = ab.Frame(scene, motion, lods, time_step=loaded.time_step)
+    frame = ab.Frame(scene, motion, lods, "count", loaded.time_step)
     frame.warm_up()
     collect()
     return frame.run(frames)[frames // 2 :]

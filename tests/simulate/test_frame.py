@@ -161,7 +161,7 @@ def test_selection_rests_while_the_finest_lods_fit(device):
     """It is left out then, and is back in the frame after one that was too long, or after LODs were set."""
     scene = scene_with(device, *MODELS)
     clock = WorkClock({"node_test": 1e-7, "triangle_test": 2e-7})
-    frame = ab.Frame(scene, make_motion(), PredictiveController(scene, 1e6), clock=clock)
+    frame = ab.Frame(scene, make_motion(), PredictiveController(scene, 1e6), "count", clock=clock)
     frame.warm_up()
     selects = np.array([row.select_ms > 0 for row in frame.run(80)])
     rests = int(np.flatnonzero(selects).max()) + 1

@@ -148,7 +148,7 @@ class StillPlayback(Playback):
 
     def _begin(self):
         self.scene.set_lods(self._started)
-        frame = Frame(self.scene, None, self._sweep, time_step=self.time_step)
+        frame = Frame(self.scene, None, self._sweep, "count", self.time_step)
         frame.warm_up()
         return frame, None, self._sweep
 

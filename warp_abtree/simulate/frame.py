@@ -102,7 +102,7 @@ class Frame(DeviceMemory):
             objects where they are.
         lods: A controller of `warp_abtree.lod.controllers`, which serves objects from states of its ladder's levels
             (`LevelStates`); or a function from time [s] to the LOD of every object, int (n,); None leaves them.
-        output: Output of the query: "any", "count", "faces" or "contacts".
+        output: Output of the query: "any", which costs least, "count", "faces" or "contacts".
         time_step: Time between frames [s], above 0.
         clock: Returns seconds; read between stages when the device has finished. A clock with a method `charge` is
             first told the counted work of the stage (`WorkClock`). None is the host's clock, on a GPU CUDA events.
@@ -120,7 +120,7 @@ class Frame(DeviceMemory):
         scene: Scene,
         motion: Any = None,
         lods: Any = None,
-        output: str = "count",
+        output: str = "any",
         time_step: float = 1 / 60,
         clock: Callable[[], float] | None = None,
     ):
