@@ -199,7 +199,8 @@ def test_a_query_is_captured_and_says_when_room_was_short(arm, device, monkeypat
     "bad, message",
     [
         (np.zeros((3, 3)), r"shape \(3, 3\), not \(c, 4\)"),
-        (np.zeros(4), r"shape \(4,\)"),
+        (np.zeros(3), r"shape \(3,\), not \(c, 4\) or \(4,\)"),
+        (np.float64(0.0), r"shape \(\)"),
         ([[0, 0, 0, 0], [0, np.nan, 0, 0]], "configuration 1 has nan for joint 'bend'"),
         ([[0, 0, 0, 0], [0, 3, 0, 0]], "configuration 1 has 3 for joint 'bend', outside -2.8 .. 2.8"),
         ("x", "configurations"),

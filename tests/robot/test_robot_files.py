@@ -253,7 +253,7 @@ def test_bad_paths_and_options_are_refused(urdf, tmp_path):
         ({"path": urdf, "geometry": "both"}, "geometry 'both'"),
         ({"path": urdf, "srdf": tmp_path / "no.srdf"}, "no.srdf: no such file"),
         ({"path": urdf, "srdf": tmp_path / "arm.srdf"}, r"names 'elbow', .* \(strict=False goes on\)"),
-        ({"path": urdf, "neutral": [0, 0]}, r"shape \(1, 2\)"),
+        ({"path": urdf, "neutral": [0, 0]}, r"shape \(2,\)"),
         ({"path": urdf, "device": "cuda:9"}, "no device 'cuda:9'"),
     ):
         refused(ValueError, message, ab.Robot.load, **arguments)

@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_abtree.checks.arguments import to_numpy
+from warp_abtree.checks.quaternions import matrices_of
 from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.robot import forward
 from warp_abtree.model.mesh import Mesh, load_mesh
 from warp_abtree.scene.objects import ALL_BITS
+from warp_abtree.state.poses import check_poses
 
 JOINT_KINDS = {"fixed": int(forward.FIXED), "revolute": int(forward.REVOLUTE), "prismatic": int(forward.PRISMATIC)}
 
@@ -62,6 +65,19 @@ class Description:
             if frame.kind == "fixed":
                 body[f] = body[frame.parent] if frame.parent >= 0 else -1
         return body
+
+    def place(self, base: np.ndarray):
+        """Move all roots by a rigid transform (4, 4): frames are then in the world that it places the robot in."""
+        for frame in self.frames:
+            if frame.parent < 0:
+                frame.origin = base @ frame.origin
+
+    def lock(self, values: dict[str, float]):
+        """Fix joints at values, and what mimics them. Pairs stay: a locked joint joins its links as one that moves."""
+        for frame in self.frames:
+            if frame.joint in values:
+                frame.offset, frame.joint = frame.offset + frame.scale * values[frame.joint], None
+        self.joints = {name: limits for name, limits in self.joints.items() if name not in values}
 
     def path(self, f: int) -> list[int]:
         """Return a frame and those that it hangs on, up to a root."""
@@ -145,6 +161,20 @@ def check_rigid(matrix, what: str) -> np.ndarray:
     fine = np.isfinite(matrix).all() and np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-12
     if not fine or np.linalg.det(rotation) < 0:
         raise RobotError(f"{what}: its transform is not rigid")
+    return matrix
+
+
+def read_pose(pose, what: str) -> np.ndarray:
+    """Return a pose, 7 numbers or a matrix, as a rigid (4, 4), by the rotation nearest to a matrix within 1e-6 of one.
+
+    Raises ValueError as `check_poses`.
+    """
+    (pose,), matrix = check_poses(to_numpy(pose, what)[None], what), np.eye(4)
+    if pose.ndim == 1:
+        matrix[:3, :3], matrix[:3, 3] = matrices_of(pose[None, 3:])[0], pose[:3]
+    else:
+        u, _, v = np.linalg.svd(pose[:3, :3])
+        matrix[:3, :3], matrix[:3, 3] = u @ v, pose[:3, 3]
     return matrix
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
+from warp_abtree.checks.quaternions import matrices_of
 from warp_abtree.interop.robot.description import (
     Description,
     Part,
@@ -129,14 +130,8 @@ def _warn_of_closures(mujoco, model, path):
 
 def _pose(position, quaternion=(1.0, 0.0, 0.0, 0.0)) -> np.ndarray:
     """Return the transform of a position and a quaternion w x y z."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    matrix[:3, 3] = position
+    matrix[:3, :3], matrix[:3, 3] = matrices_of([np.roll(quaternion, -1)])[0], position
     return matrix
 
 

@@ -1,7 +1,8 @@
 """`Robot`: the links of a URDF or MJCF file, posed and checked at many configurations.
 
-A configuration holds a value of each of `joint_names` [rad, or the file's unit of length]. Frames are those of the
-file: poses of links are in that of its root, and what surrounds the robot is placed in it.
+A configuration holds a value of each of `joint_names` [rad, or the file's unit of length]: one is of shape (n,), many
+(c, n), and answers about one have no leading axis. Poses of links are in the world, in which `base` places the frame of
+the file's root, and what surrounds the robot its objects.
 """
 
 from pathlib import Path
@@ -9,11 +10,19 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import check_device, flag, is_device_array, to_numpy, whole_number, wrap_array
+from warp_abtree.checks.arguments import (
+    check_device,
+    finite_array,
+    flag,
+    is_device_array,
+    to_numpy,
+    whole_number,
+    wrap_array,
+)
 from warp_abtree.interop.robot.check import RobotQuery, check_edges
-from warp_abtree.interop.robot.description import Description, RobotError
+from warp_abtree.interop.robot.description import Description, RobotError, read_pose
 from warp_abtree.interop.robot.mjcf import read_mjcf
-from warp_abtree.interop.robot.surroundings import make_surroundings
+from warp_abtree.interop.robot.surroundings import STILL, make_surroundings
 from warp_abtree.interop.robot.urdf import apply_srdf, read_urdf
 from warp_abtree.kernels.robot import forward
 from warp_abtree.model.files.found import warn_caller
@@ -49,9 +58,6 @@ class Robot:
 
     def __init__(self, description: Description, device=None, mounted=()):
         self.device = Scene(device).device
-        self.description = description
-        self.joint_names, self.link_names = tuple(description.joints), tuple(description.links)
-        self.limits = np.array(list(description.joints.values()), np.float64).reshape(-1, 2)
         if not description.parts:
             raise RobotError("the robot has no link with a mesh")
         # Only the finest LOD is asked, so there is nothing to collapse.
@@ -59,13 +65,31 @@ class Robot:
         self.models = [Model.load(mesh, base_faces=len(mesh.faces)) for mesh in meshes]
         self.model_link = np.array([part.link for part in description.parts])
         self.pairs = np.array(description.allowed_pairs(), np.int64).reshape(-1, 2)
+        self._describe(description)
         self.mounted = self._find_mounted(mounted)
+
+    def _describe(self, description: Description):
+        """Go by a description from now on; queries are made anew."""
+        self.description = description
+        self.joint_names, self.link_names = tuple(description.joints), tuple(description.links)
+        self.limits = np.array(list(description.joints.values()), np.float64).reshape(-1, 2)
         self._chain = description.make_chain(self.device)
         self._links = wp.array(np.array(list(description.links.values()), np.int32), device=self.device)
         self._kept: dict[tuple, RobotQuery] = {}
 
     @classmethod
-    def load(cls, path, geometry="collision", device=None, mounted=(), srdf=None, neutral=None, strict=True) -> "Robot":
+    def load(
+        cls,
+        path,
+        geometry="collision",
+        device=None,
+        mounted=(),
+        srdf=None,
+        neutral=None,
+        strict=True,
+        base=STILL,
+        locked=None,
+    ) -> "Robot":
         """Load a robot from a URDF (.urdf, by yourdfpy) or MJCF file (.xml, by MuJoCo).
 
         Joints may be fixed, revolute, continuous, prismatic, and mimic others. Of URDF, revolute and prismatic ones
@@ -86,6 +110,8 @@ class Robot:
                 link of `disable_default_collisions`.
             neutral: Configuration in which links that intersect are excluded, too; None for none.
             strict: Whether to refuse an SRDF that names links which the robot has not, rather than warn.
+            base: Pose of the file's root in the world, 7 numbers or a rigid (4, 4), as for `Scene.add`.
+            locked: Values of joints that are fixed at them, by name, and no longer of a configuration.
 
         Warns of what ties links beside their joints and is not enforced: of MJCF `equality` other than between joints,
         and limits of tendons; of URDF joints of Gazebo's and Drake's elements. And of what is not read: macros of xacro
@@ -96,24 +122,28 @@ class Robot:
             ValueError: A file that is missing or unreadable, or has no mesh of this geometry, a joint or shape of
                 another kind, a bad option; the message names it.
         """
-        path = Path(path)
-        if path.suffix.lower() not in ENDINGS:
-            raise RobotError(f"{path}: a robot is a .urdf or .xml file")
-        if geometry not in ("collision", "visual"):
-            raise ValueError(f"geometry {geometry!r} is neither 'collision' nor 'visual'")
-        for file in (path, *([] if srdf is None else [Path(srdf)])):
-            if not file.is_file():
-                raise RobotError(f"{file}: no such file")
-        description = ENDINGS[path.suffix.lower()](path, geometry)
-        if not description.parts:
-            other = "visual" if geometry == "collision" else "collision"
-            raise RobotError(f"{path}: no link has a mesh of geometry={geometry!r}; it may have some of {other!r}")
-        if srdf is not None:
-            apply_srdf(description, Path(srdf), flag(strict, "strict"))
+        base = read_pose(base, "base")
+        description = read_robot(Path(path), geometry, None if srdf is None else Path(srdf), flag(strict, "strict"))
+        description.place(base)
         robot = cls(description, device, mounted)
+        robot._lock({} if locked is None else locked)
         if neutral is not None:
             robot.exclude_meeting(neutral)
         return robot
+
+    def _lock(self, values):
+        """Fix joints at values, by name."""
+        if not isinstance(values, dict):
+            raise TypeError(f"locked: a {type(values).__name__} is no dict of values by the names of joints")
+        row = np.clip(0.0, *self.limits.T)
+        for name, value in values.items():
+            if name not in self.joint_names:
+                raise ValueError(f"locked: a configuration has no joint {name!r}")
+            row[self.joint_names.index(name)] = finite_array(value, f"locked joint {name!r}", ())
+        if fault := self._find_fault(wp.array(row[None], dtype=wp.float64, device=self.device), True):
+            raise ValueError(f"locked: {fault[1]}")
+        self.description.lock({name: float(row[self.joint_names.index(name)]) for name in values})
+        self._describe(self.description)
 
     def _find_mounted(self, names) -> list[int]:
         """Return the links of names, and in the place of one without a mesh all that are rigidly fixed to it."""
@@ -142,19 +172,38 @@ class Robot:
 
     def exclude_meeting(self, configuration):
         """Test models no more that intersect at a configuration, (n,), as neighbours may. Waits for the device."""
-        poses = self.forward(np.asarray(configuration)[None]).numpy()[0]
         scene = Scene(self.device)
-        scene.add_many(self.models, poses[self.model_link])
+        self.add_to(scene, configuration)
         pairs = check_pairs(self.pairs, len(self.models))
         self.pairs = pairs[~scene.intersect(pairs).any]
 
+    def add_to(self, scene: Scene, configuration) -> np.ndarray:
+        """Add the links at a configuration, (n,), to a scene, and return their indices there, one of each of `models`.
+
+        Objects have the names of links; pairs that the robot does not test are filtered there.
+
+        Raises:
+            TypeError, ValueError: No scene, or a bad configuration; nothing is added.
+        """
+        if not isinstance(scene, Scene):
+            raise TypeError(f"add_to: a {type(scene).__name__} is no Scene")
+        poses = self.forward(configuration)
+        if poses.ndim != 1:
+            raise ValueError(f"add_to: {len(poses)} configurations, not one of shape ({len(self.joint_names)},)")
+        pairs, names = check_pairs(self.pairs, len(self.models)), [self.link_names[k] for k in self.model_link]
+        added = scene.add_many(self.models, poses.numpy()[self.model_link], names=names)
+        tested = np.eye(len(added), dtype=bool)
+        tested[tuple(pairs.T)] = tested[tuple(pairs.T[::-1])] = True
+        scene.filter(added[np.argwhere(~tested)])
+        return added
+
     def forward(self, configurations, limits=True) -> wp.array:
-        """Return the poses of all links, device mat44d (c, links), in the frame of the root.
+        """Return the poses of all links in the world, device mat44d (c, links), or (links,) of one configuration.
 
         Waits for the device once, for what is refused.
 
         Args:
-            configurations: (c, n) of any framework; float64 on the robot's GPU is read where it lies.
+            configurations: (c, n) or (n,) of any framework; float64 on the robot's GPU is read where it lies.
             limits: Whether to refuse configurations out of limits. What is beyond a limit by no more than 2^-51 of the
                 greater one, 2^-22 if it is a float32 number, as rounding puts it there, is within, and taken as it is.
 
@@ -162,7 +211,7 @@ class Robot:
             ValueError: Another shape, a number that is not finite, one out of its limits; the first is named.
         """
         check_device(self.device, "Robot.forward")
-        rows = self._take(configurations, limits)
+        rows, is_one = self._take(configurations, limits)
         frames, shape = forward.Frames(), (len(rows), len(self.description.frames))
         frames.rotation = wp.empty(shape, dtype=wp.mat33d, device=self.device)
         frames.position = wp.empty(shape, dtype=wp.vec3d, device=self.device)
@@ -170,7 +219,7 @@ class Robot:
         if len(rows):
             wp.launch(forward.forward_kernel, len(rows), [self._chain, rows, frames], device=self.device)
             wp.launch(forward.write_link_kernel, poses.shape, [self._links, frames, poses], device=self.device)
-        return poses
+        return poses[0] if is_one else poses
 
     def check(self, configurations, world=None, output="any", beyond=None, limits=True):
         """Check whether parts intersect, each other or the world, at each configuration, or how far they are apart.
@@ -201,8 +250,9 @@ class Robot:
             raise ValueError(f"beyond means nothing for output {output!r}")
         far = float(check_beyond(beyond))
         check_device(self.device, "Robot.check (RobotQuery.launch can)")
-        rows = self._take(configurations, limits)
-        return self._find_query(world, output, len(rows)).ask(rows, far)
+        rows, is_one = self._take(configurations, limits)
+        answers = self._find_query(world, output, len(rows)).ask(rows, far)
+        return answers[0] if is_one else answers
 
     def check_edges(self, starts, ends, world=None, tolerance=1e-3, limits=True) -> np.ndarray:
         """Find when parts first touch on edges of a planner: all joints move evenly from start to end, in unit time.
@@ -224,14 +274,15 @@ class Robot:
             TypeError, ValueError: As `check`.
         """
         check_device(self.device, "Robot.check_edges")
-        first, last = (self._take(given, limits, what).numpy() for given, what in ((starts, "starts"), (ends, "ends")))
+        (first, is_one), (last, also) = self._take(starts, limits, "starts"), self._take(ends, limits, "ends")
         if len(first) != len(last):
             raise ValueError(f"ends: {len(last)} given for {len(first)} starts")
         tolerance = to_numpy(tolerance, "tolerance")
         if tolerance.shape != () or not 2.0**-30 <= tolerance < 1:
             raise ValueError(f"tolerance: {tolerance} is no number of 2^-30 or more, below 1")
         query = self._find_query(world, "within", STRETCHES * len(first))
-        return check_edges(query, first, last, float(tolerance))
+        rows = check_edges(query, first.numpy(), last.numpy(), float(tolerance))
+        return rows[0] if is_one and also else rows
 
     def query(self, world=None, output="any", room=4096) -> RobotQuery:
         """Return an operator for a fixed number of configurations, which a CUDA graph can capture: `RobotQuery`."""
@@ -241,37 +292,43 @@ class Robot:
         room = whole_number(room, "room", 1, 2**22)
         return RobotQuery(self, make_surroundings(world, self.device)[0], output, room)
 
-    def _take(self, configurations, limits, what="configurations") -> wp.array:
-        """Return configurations as device rows, float64 (c, n), checked. Waits for the device."""
+    def _take(self, configurations, limits, what="configurations") -> tuple[wp.array, bool]:
+        """Return configurations as checked device rows, float64 (c, n), and whether one was given. Waits for it."""
         limits = flag(limits, "limits")
         width = len(self.joint_names)
         given = wrap_array(configurations, what) if is_device_array(configurations) else None
         if given is not None and given.device == self.device and given.dtype == wp.float64:
-            rows = given if given.is_contiguous else given.contiguous()
+            numbers = given if given.is_contiguous else given.contiguous()
         else:
-            numbers = np.ascontiguousarray(to_numpy(configurations, what), np.float64)
-            dims = numbers.ndim == 2
-            rows = wp.array(numbers, dtype=wp.float64, device=self.device) if dims and len(numbers) else numbers
-        if len(rows.shape) != 2 or rows.shape[1] != width:
-            raise ValueError(f"{what}: shape {tuple(rows.shape)}, not (c, {width}), a value of each joint")
-        if len(rows) == 0:
-            return wp.empty((0, width), dtype=wp.float64, device=self.device)
+            numbers = np.asarray(to_numpy(configurations, what), np.float64, order="C")
+        if len(numbers.shape) not in (1, 2) or numbers.shape[-1] != width:
+            shape = tuple(numbers.shape)
+            raise ValueError(f"{what}: shape {shape}, not (c, {width}) or ({width},), a value of each joint")
+        is_one = len(numbers.shape) == 1
+        if is_one:
+            numbers = numbers.reshape((1, width))
+        if len(numbers) == 0:
+            return wp.empty((0, width), dtype=wp.float64, device=self.device), False
+        is_placed = isinstance(numbers, wp.array)
+        rows = numbers if is_placed else wp.array(numbers, dtype=wp.float64, device=self.device)
+        if fault := self._find_fault(rows, limits):
+            hint = " (limits=False takes it)" if "outside" in fault[1] else ""
+            raise ValueError(f"{what}: {what[:-1]} {fault[0]} has {fault[1]}{hint}")
+        return rows, is_one
+
+    def _find_fault(self, rows, limits) -> tuple[int, str] | None:
+        """Return the first of device rows that has a bad value, and what is wrong with it. Waits for the device."""
         first = wp.full(1, int(forward.NO_BAD_NUMBER), dtype=wp.int64, device=self.device)
         inputs = [int(limits), len(rows), self._chain, rows, first]
         wp.launch(forward.check_configuration_kernel, len(rows), inputs, device=self.device)
         bad = int(first.numpy()[0])
-        if bad != int(forward.NO_BAD_NUMBER):
-            self._refuse(rows, *divmod(bad, width), what)
-        return rows
-
-    def _refuse(self, rows, i, k, what):
-        """Raise ValueError about a value of a configuration that is none."""
+        if bad == int(forward.NO_BAD_NUMBER):
+            return None
+        i, k = divmod(bad, len(self.joint_names))
         value = float(rows[i : i + 1].numpy()[0, k])
-        told = f"{what}: {what[:-1]} {i} has {exact(value)} for joint {self.joint_names[k]!r}"
-        if not abs(value) < forward.ANGLE_MAX:
-            raise ValueError(told)
         low, high = map(exact, self.limits[k])
-        raise ValueError(f"{told}, outside {low} .. {high} (limits=False takes it)")
+        beyond = f", outside {low} .. {high}" if abs(value) < forward.ANGLE_MAX else ""
+        return i, f"{exact(value)} for joint {self.joint_names[k]!r}{beyond}"
 
     def _find_query(self, world, output, count) -> RobotQuery:
         """Return a query of a room for a number of configurations: the one of before if it is of the same."""
@@ -286,6 +343,24 @@ class Robot:
         for old in list(self._kept)[:-KEPT]:
             del self._kept[old]
         return query
+
+
+def read_robot(path: Path, geometry: str, srdf: Path | None, strict: bool) -> Description:
+    """Read the files of a robot; see `Robot.load`."""
+    if path.suffix.lower() not in ENDINGS:
+        raise RobotError(f"{path}: a robot is a .urdf or .xml file")
+    if geometry not in ("collision", "visual"):
+        raise ValueError(f"geometry {geometry!r} is neither 'collision' nor 'visual'")
+    for file in (path, *([] if srdf is None else [srdf])):
+        if not file.is_file():
+            raise RobotError(f"{file}: no such file")
+    description = ENDINGS[path.suffix.lower()](path, geometry)
+    if not description.parts:
+        other = "visual" if geometry == "collision" else "collision"
+        raise RobotError(f"{path}: no link has a mesh of geometry={geometry!r}; it may have some of {other!r}")
+    if srdf is not None:
+        apply_srdf(description, srdf, strict)
+    return description
 
 
 def exact(number) -> str:
