@@ -17,6 +17,10 @@ from warp_abtree.state.poses import check_poses
 JOINT_KINDS = {"fixed": int(forward.FIXED), "revolute": int(forward.REVOLUTE), "prismatic": int(forward.PRISMATIC)}
 
 
+# What a configuration sets of a joint with several values, as "joint/x" and so on; of a floating one as URDF's xyz rpy.
+COORDINATES = {"planar": ("x", "y", "angle"), "floating": ("x", "y", "z", "roll", "pitch", "yaw")}
+
+
 class RobotError(ValueError):
     """A robot's file that is missing, unreadable, or holds what is not supported; the message names what and where."""
 
@@ -57,6 +61,31 @@ class Description:
     demanded: set[frozenset] = field(default_factory=set)  # pairs of indices of parts that are tested, whatever else
     # Links that a joint joins and that are not tested: "all", "moving" if both move against the root, "none".
     neighbours: str = "all"
+    loose: set[int] = field(default_factory=set)  # frames of floating joints, which join nothing
+
+    def add_coordinates(self, joint: str, kind: str):
+        """Let a configuration set the values of a joint of `COORDINATES`, without limits."""
+        self.joints |= {f"{joint}/{name}": (-np.inf, np.inf) for name in COORDINATES[kind]}
+
+    def add_joint_frames(self, parent: int, origin: np.ndarray, joint: str, kind: str, axis=(0.0, 0.0, 1.0)):
+        """Add the frames of a joint of `COORDINATES`, a slide or a turn each; the link's is the last.
+
+        A planar joint slides along x and y, then turns, in the plane across its axis: x is what the coordinate axis
+        that follows the one nearest to the axis, in the order x y z x, leaves in the plane, and y axis cross x.
+        """
+        if kind == "planar":
+            u = np.eye(3)[(np.argmax(np.abs(axis)) + 1) % 3]
+            u = unit_axis(u - np.dot(u, axis) * np.array(axis), joint)
+            axes = {"x": u, "y": tuple(np.cross(axis, u)), "angle": axis}
+        else:
+            x, y, z = map(tuple, np.eye(3))
+            axes = {"x": x, "y": y, "z": z, "yaw": z, "pitch": y, "roll": x}
+        for name, along in axes.items():
+            moves = "prismatic" if len(name) == 1 else "revolute"
+            self.frames.append(RobotFrame(parent, origin, moves, along, f"{joint}/{name}"))
+            parent, origin = len(self.frames) - 1, np.eye(4)
+        if kind == "floating":
+            self.loose.add(parent)
 
     def bodies(self) -> np.ndarray:
         """Return the rigid body of each frame, int (frames,): the frame from which on no joint moves it."""
@@ -99,6 +128,8 @@ class Description:
         with_links = {-1, *(body[f] for f in self.links.values())}
 
         def holder(b):  # body that a body's joint hangs on; joints in a row, without links between them, are one
+            if b in self.loose:
+                return None
             parent = self.frames[b].parent
             while parent >= 0 and body[parent] not in with_links:
                 parent = self.frames[body[parent]].parent
