@@ -277,8 +277,7 @@ def test_a_mounted_link_without_a_mesh_takes_those_fixed_to_it(device):
     rows = np.array([[0.0, 0, 0.05, 0]])
     assert ab.Robot(made, device, ["base"]).check(rows, ground)[0]
     assert not ab.Robot(made, device, ["world"]).check(rows, ground)[0]
-    with pytest.warns(RuntimeWarning, match="no mesh is fixed to the link 'eye'"):
-        assert ab.Robot(made, device, ["eye"]).check(rows, ground)[0]
+    refused(ValueError, "mounted: no mesh is fixed to the link .eye.", ab.Robot, made, device, ["eye"])
 
 
 def test_a_robot_is_copied_and_pickled(arm):

@@ -1,7 +1,7 @@
 """Description of a robot, whatever its file format: frames and joints, links, parts, and pairs never tested."""
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from warp_abtree.checks.quaternions import matrices_of
 from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.robot import forward
 from warp_abtree.model.mesh import Mesh, load_mesh
+from warp_abtree.model.model import Model
 from warp_abtree.scene.objects import ALL_BITS
 from warp_abtree.state.poses import check_poses
 
@@ -43,7 +44,7 @@ class Part:
     """Mesh of a link, in the link's frame, and the bits of MJCF that say which others it meets."""
 
     link: int
-    mesh: Mesh
+    mesh: Mesh | Model  # a model if it is attached, and no link of the file
     group: int = 1
     mask: int = ALL_BITS
 
@@ -107,6 +108,28 @@ class Description:
             if frame.joint in values:
                 frame.offset, frame.joint = frame.offset + frame.scale * values[frame.joint], None
         self.joints = {name: limits for name, limits in self.joints.items() if name not in values}
+
+    def attached(self) -> tuple[str, ...]:
+        """Return the names of links that are attached models."""
+        return tuple(list(self.links)[part.link] for part in self.parts if isinstance(part.mesh, Model))
+
+    def with_model(self, name: str, model: Model, link: str, pose: np.ndarray) -> "Description":
+        """Return it with a model that is fixed to a link, a link itself, the last."""
+        frames, links = [*self.frames, RobotFrame(self.links[link], pose)], self.links | {name: len(self.frames)}
+        return replace(self, frames=frames, links=links, parts=[*self.parts, Part(len(self.links), model)])
+
+    def without_model(self, name: str) -> "Description":
+        """Return it without an attached model; raise ValueError if there is none, or others are attached to it."""
+        if name not in self.attached():
+            raise ValueError(f"detach: no attached model has the name {name!r}")
+        for other in self.attached():
+            if self.frames[self.links[other]].parent == self.links[name]:
+                raise ValueError(f"detach: {other!r} is attached to {name!r}")
+        f, k = self.links[name], list(self.links).index(name)
+        frames = [replace(frame, parent=frame.parent - (frame.parent > f)) for frame in self.frames]
+        parts = [replace(part, link=part.link - (part.link > k)) for part in self.parts if part.link != k]
+        links = {other: at - (at > f) for other, at in self.links.items() if other != name}
+        return replace(self, frames=frames[:f] + frames[f + 1 :], links=links, parts=parts)
 
     def path(self, f: int) -> list[int]:
         """Return a frame and those that it hangs on, up to a root."""

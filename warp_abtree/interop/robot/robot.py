@@ -21,17 +21,15 @@ from warp_abtree.checks.arguments import (
 )
 from warp_abtree.interop.robot.check import RobotQuery, check_edges
 from warp_abtree.interop.robot.description import Description, RobotError, read_pose
-from warp_abtree.interop.robot.mjcf import read_mjcf
+from warp_abtree.interop.robot.files import read_robot
 from warp_abtree.interop.robot.surroundings import STILL, make_surroundings
-from warp_abtree.interop.robot.urdf import apply_srdf, read_urdf
 from warp_abtree.kernels.robot import forward
-from warp_abtree.model.files.found import warn_caller
 from warp_abtree.model.model import Model
 from warp_abtree.query.stages.distance import check_beyond
+from warp_abtree.scene.objects import check_models, check_object_names
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.batch import check_pairs
 
-ENDINGS = {".urdf": read_urdf, ".xml": read_mjcf, ".mjcf": read_mjcf}
 # Configurations of a launch: fewer where few are given.
 ROOMS = {"cpu": (16, 256, 4096), "cuda": (1024, 8192, 65536)}
 # Stretches of an edge at a time, for the room of a chunk.
@@ -46,6 +44,7 @@ class Robot:
         joint_names: Names of the joints that a configuration sets, in its order.
         limits: Least and greatest value of each, float64 (n, 2); infinite where there is none.
         link_names: Names of all links, in the order of `forward`.
+        attached: Names of those of them that are attached models.
         models: `Model` of each part: the mesh of a link, in the link's frame.
         model_link: Index into `link_names` of each model, int (m,).
         pairs: Pairs of models that are tested against one another, int (p, 2).
@@ -61,18 +60,26 @@ class Robot:
         if not description.parts:
             raise RobotError("the robot has no link with a mesh")
         # Only the finest LOD is asked, so there is nothing to collapse.
-        meshes = [part.mesh for part in description.parts]
-        self.models = [Model.load(mesh, base_faces=len(mesh.faces)) for mesh in meshes]
-        self.model_link = np.array([part.link for part in description.parts])
+        self.models = [
+            part.mesh if isinstance(part.mesh, Model) else Model.load(part.mesh, base_faces=len(part.mesh.faces))
+            for part in description.parts
+        ]
         self.pairs = np.array(description.allowed_pairs(), np.int64).reshape(-1, 2)
         self._describe(description)
-        self.mounted = self._find_mounted(mounted)
+        self.mounted: list[int] = []
+        body = description.bodies()[list(description.links.values())]
+        for k in self._find_links(mounted, "mounted"):
+            fixed = [k] if k in self.model_link else np.flatnonzero(body == body[k]).tolist()
+            if not np.isin(fixed, self.model_link).any():
+                raise ValueError(f"mounted: no mesh is fixed to the link {self.link_names[k]!r}")
+            self.mounted += [link for link in fixed if link not in self.mounted]
 
     def _describe(self, description: Description):
         """Go by a description from now on; queries are made anew."""
         self.description = description
         self.joint_names, self.link_names = tuple(description.joints), tuple(description.links)
         self.limits = np.array(list(description.joints.values()), np.float64).reshape(-1, 2)
+        self.attached, self.model_link = description.attached(), np.array([part.link for part in description.parts])
         self._chain = description.make_chain(self.device)
         self._links = wp.array(np.array(list(description.links.values()), np.int32), device=self.device)
         self._kept: dict[tuple, RobotQuery] = {}
@@ -104,7 +111,7 @@ class Robot:
                 are the geoms of groups 0 to 2, and meshes have vertices in float32, as MuJoCo compiles them.
             device: Warp device; None for Warp's default.
             mounted: Names of links that are never tested against what surrounds the robot, as a base that stands on it.
-                One without a mesh stands for all links that are rigidly fixed to it; RuntimeWarning if none has one.
+                One without a mesh stands for all links that are rigidly fixed to it, of which one must have one.
             srdf: Path of an SRDF file: pairs that `disable_collisions` names are excluded, others that
                 `enable_collisions` names are tested, whatever else holds, and of the rest those are excluded with a
                 link of `disable_default_collisions`.
@@ -145,22 +152,14 @@ class Robot:
         self.description.lock({name: float(row[self.joint_names.index(name)]) for name in values})
         self._describe(self.description)
 
-    def _find_mounted(self, names) -> list[int]:
-        """Return the links of names, and in the place of one without a mesh all that are rigidly fixed to it."""
+    def _find_links(self, names, what: str) -> list[int]:
+        """Return the indices of links of names."""
         if isinstance(names, str):
-            raise TypeError(f"mounted: {names!r} is a name, not a list of names of links")
-        names = list(names)
-        unknown = set(names) - set(self.link_names)
-        if unknown:
-            raise ValueError(f"mounted: the robot has no link {sorted(unknown)[0]!r}")
-        body = self.description.bodies()[list(self.description.links.values())]
-        found: dict[int, None] = {}
-        for k in map(self.link_names.index, names):
-            fixed = [k] if k in self.model_link else np.flatnonzero(body == body[k]).tolist()
-            if not np.isin(fixed, self.model_link).any():
-                warn_caller(f"mounted: no mesh is fixed to the link {self.link_names[k]!r}: naming it changes nothing")
-            found |= dict.fromkeys(fixed)
-        return list(found)
+            raise TypeError(f"{what}: {names!r} is a name, not a list of names of links")
+        for name in names:
+            if name not in self.link_names:
+                raise ValueError(f"{what}: the robot has no link {name!r}")
+        return [self.link_names.index(name) for name in names]
 
     def __reduce__(self):
         kept = {"pairs": self.pairs, "mounted": self.mounted}
@@ -176,6 +175,47 @@ class Robot:
         self.add_to(scene, configuration)
         pairs = check_pairs(self.pairs, len(self.models))
         self.pairs = pairs[~scene.intersect(pairs).any]
+
+    def attach(self, model: Model, link: str, pose=STILL, name: str | None = None, touches=()):
+        """Fix a model to a link that holds it: it is the last link then, and tested at its finest LOD.
+
+        That is against what surrounds the robot and all links but those that are rigidly fixed to the one that holds
+        it. Operators of `query` go by what was attached when they were made.
+
+        Args:
+            pose: Of the model in the link's frame, 7 numbers or a rigid (4, 4).
+            name: Of the new link; None for the model's.
+            touches: Names of links that it is not tested against, as the fingers that grip it.
+
+        Raises:
+            TypeError, ValueError: Bad arguments, a name that a link has; nothing is changed.
+        """
+        check_models(model, 1)
+        name = model.name if name is None else name
+        check_object_names([name], 1)
+        if name in self.link_names:
+            raise ValueError(f"attach: the robot has a link {name!r} already")
+        self._find_links([link], "attach")
+        touched, pairs = self._find_links(touches, "touches"), check_pairs(self.pairs, len(self.models))
+        description = self.description.with_model(name, model, link, read_pose(pose, "pose"))
+        body = description.bodies()[list(description.links.values())]
+        tested = (body[self.model_link] != body[-1]) & ~np.isin(self.model_link, touched)
+        added = [(k, len(self.models)) for k in np.flatnonzero(tested)]
+        self._describe(description)
+        self.models, self.pairs = (
+            [*self.models, model],
+            np.concatenate([pairs, np.array(added, np.int64).reshape(-1, 2)]),
+        )
+
+    def detach(self, name: str):
+        """Take an attached model away; raise ValueError if there is none, or others are attached to it."""
+        description, pairs = self.description.without_model(name), check_pairs(self.pairs, len(self.models))
+        link = self.link_names.index(name)
+        k = self.model_link.tolist().index(link)
+        self.mounted = [other - (other > link) for other in self.mounted if other != link]
+        self.models, pairs = self.models[:k] + self.models[k + 1 :], pairs[(pairs != k).all(1)]
+        self.pairs = pairs - (pairs > k)
+        self._describe(description)
 
     def add_to(self, scene: Scene, configuration) -> np.ndarray:
         """Add the links at a configuration, (n,), to a scene, and return their indices there, one of each of `models`.
@@ -221,7 +261,7 @@ class Robot:
             wp.launch(forward.write_link_kernel, poses.shape, [self._links, frames, poses], device=self.device)
         return poses[0] if is_one else poses
 
-    def check(self, configurations, world=None, output="any", beyond=None, limits=True):
+    def check(self, configurations, world=None, output="any", beyond=None, limits=True, which=False):
         """Check whether parts intersect, each other or the world, at each configuration, or how far they are apart.
 
         Exactly, as `Scene.intersect`, for link poses as `forward` computes them. Waits for the device, once a chunk of
@@ -234,12 +274,15 @@ class Robot:
             output: "any" or "distance".
             beyond: For "distance", what is farther apart is infinitely far [world units].
             limits: Whether to refuse configurations out of limits.
+            which: Whether to return, of "any", the pairs that intersect.
 
         Returns:
-            For "any" bool (c,). For "distance" a structured array (c,) of distance, 0 where parts intersect; points (2,
-            3), nearest on a part of the robot and on what it is nearest to, and faces (2,) that they lie on; pair (2,):
-            the part's index into `models`, and that of the other one, or len(models) + object of the world. Where all
-            is beyond, points are NaN and the others -1.
+            For "any" bool (c,); with `which` a sorted list of pairs of names for each configuration, each pair once: a
+            link, and a later one or an object of the world (`Scene.name`). For "distance" a structured array (c,) of
+            distance, 0 where parts intersect; points (2, 3), nearest on a part of the robot and on what it is nearest
+            to, and faces (2,) that they lie on; pair (2,): the part's index into `models`, and that of the other one,
+            or len(models) + object of the world; and their names (2,). Where all is beyond, points are NaN, names
+            empty, and the others -1.
 
         Raises:
             TypeError, ValueError: Bad configurations, the first of which is named, a bad world or option.
@@ -248,10 +291,12 @@ class Robot:
             raise ValueError(f"output {output!r} is neither 'any' nor 'distance'")
         if beyond is not None and output != "distance":
             raise ValueError(f"beyond means nothing for output {output!r}")
+        if flag(which, "which") and output != "any":
+            raise ValueError(f"which means nothing for output {output!r}")
         far = float(check_beyond(beyond))
         check_device(self.device, "Robot.check (RobotQuery.launch can)")
         rows, is_one = self._take(configurations, limits)
-        answers = self._find_query(world, output, len(rows)).ask(rows, far)
+        answers = self._find_query(world, "pairs" if which else output, len(rows)).ask(rows, far)
         return answers[0] if is_one else answers
 
     def check_edges(self, starts, ends, world=None, tolerance=1e-3, limits=True) -> np.ndarray:
@@ -343,24 +388,6 @@ class Robot:
         for old in list(self._kept)[:-KEPT]:
             del self._kept[old]
         return query
-
-
-def read_robot(path: Path, geometry: str, srdf: Path | None, strict: bool) -> Description:
-    """Read the files of a robot; see `Robot.load`."""
-    if path.suffix.lower() not in ENDINGS:
-        raise RobotError(f"{path}: a robot is a .urdf or .xml file")
-    if geometry not in ("collision", "visual"):
-        raise ValueError(f"geometry {geometry!r} is neither 'collision' nor 'visual'")
-    for file in (path, *([] if srdf is None else [srdf])):
-        if not file.is_file():
-            raise RobotError(f"{file}: no such file")
-    description = ENDINGS[path.suffix.lower()](path, geometry)
-    if not description.parts:
-        other = "visual" if geometry == "collision" else "collision"
-        raise RobotError(f"{path}: no link has a mesh of geometry={geometry!r}; it may have some of {other!r}")
-    if srdf is not None:
-        apply_srdf(description, srdf, strict)
-    return description
 
 
 def exact(number) -> str:
