@@ -49,7 +49,7 @@ class Robot:
         model_link: Index into `link_names` of each model, int (m,).
         pairs: Pairs of models that are tested against one another, int (p, 2).
         mounted: Indices into `link_names` of the links that are not tested against what surrounds the robot.
-        description: What the file says, `warp_abtree.interop.robot.description.Description`.
+        description: What it is made of, `warp_abtree.interop.robot.description.Description`.
 
     `pairs` and `mounted` may be set: each call goes by what they are then. A copy, or what is unpickled, is made anew
     from the description, on the same device, with `pairs` and `mounted`.
@@ -99,8 +99,9 @@ class Robot:
     ) -> "Robot":
         """Load a robot from a URDF (.urdf, by yourdfpy) or MJCF file (.xml, by MuJoCo).
 
-        Joints may be fixed, revolute, continuous, prismatic, and mimic others. Of URDF, revolute and prismatic ones
-        must have limits, 0 where one of two is not given. Tested against one another are all links but those that are
+        Joints may be fixed, revolute, continuous, prismatic, and mimic others; planar, floating and free ones have
+        values "joint/x" and so on (`description.COORDINATES`). Of URDF, revolute and prismatic ones must have limits, 0
+        where one of two is not given. Tested against one another are all links but those that are
         rigidly joined, that a joint joins, or that the file or the SRDF excludes. Of MJCF, "collision" has MuJoCo's
         pairs: by contype, conaffinity, `contact/exclude` and `contact/pair`, and links on a joint are tested against
         what it hangs on where that stands still, or with `filterparent` disabled. Meshes of a URDF are mirrored by
