@@ -123,6 +123,7 @@ def test_an_edge_is_blocked_by_what_is_held(device):
     car.attach(rod, "link 1", (0.25, 0, 0, 0, 0, 0, 1), name="rod")
     row = car.check_edges([0.0], [1.0], world, tolerance=1e-4)
     assert not row["clear"] and 0.8 - 1e-4 <= row["time"] <= 0.8
+    assert car.check([[0.7], [0.9]], which=True) == [[], []]
     assert car.check([[0.7], [0.9]], world, which=True) == [[], [("rod", f"{wall.name} 0")]]
     scene = ab.Scene(device)
     assert car.add_to(scene, [0.0]).tolist() == [0, 1] and [scene.name(i) for i in (0, 1)] == ["link 1", "rod"]

@@ -15,10 +15,10 @@ TURNED = Rotation.from_euler("xyz", (0.3, -0.2, 0.7)).as_matrix()
 WALL = trimesh.creation.box((0.02, 4, 4))
 
 
-def load(folder, kind, axis, device, joint="turn"):
+def load(folder, kind, axis, device):
     """Return the arm of `URDF` with its first joint of a kind, off the origin of the base."""
     pytest.importorskip("yourdfpy")
-    text = URDF.replace(f'name="{joint}" type="continuous"', f'name="{joint}" type="{kind}"')
+    text = URDF.replace('name="turn" type="continuous"', f'name="turn" type="{kind}"')
     text = text.replace('<origin xyz="0 0 0.1"/>', '<origin xyz="0.5 0 0.1" rpy="0.3 -0.2 0.7"/>')
     text = text.replace('<axis xyz="0 0 2"/>', f'<axis xyz="{axis}"/>' if axis else "")
     return ab.Robot.load(write_arm(folder, text, "arm.urdf"), device=device)
@@ -86,6 +86,9 @@ def mesh_of(mesh):
 def test_a_free_joint_is_the_pose_of_its_body_in_the_world(tmp_path, device):
     mujoco = pytest.importorskip("mujoco")
     text = MJCF.replace('<body name="base">', '<body name="base" pos="1 2 3" euler="1 0 0"><freejoint name="loose"/>')
+    rock = '<worldbody><geom type="box" size="0.1 0.1 0.1"/>'
+    visual = ab.Robot.load(write_arm(tmp_path, text.replace("<worldbody>", rock), "arm.xml"), "visual", device)
+    assert frozenset(("world", "base")) in asked_pairs(visual)
     path = write_arm(tmp_path, text, "arm.xml")
     base = np.eye(4)
     base[:3, :3], base[:3, 3] = TURNED, (0.1, 0.2, 0.3)

@@ -71,8 +71,8 @@ def test_locked_joints_stand_at_their_values(tmp_path, device):
     hit = whole.check(full, AROUND)
     assert 3 < hit.sum() < 57
     np.testing.assert_array_equal(locked.check(rows, AROUND), hit)
-    edges = locked.check_edges(rows[:20], rows[1:21], AROUND)
-    np.testing.assert_array_equal(edges, whole.check_edges(full[:20], full[1:21], AROUND))
+    edges = locked.check_edges(rows[:6], rows[1:7], AROUND)
+    np.testing.assert_array_equal(edges, whole.check_edges(full[:6], full[1:7], AROUND))
     still = ab.Robot.load(path, device=device, locked=at | {"bend": 1.0})
     assert still.joint_names == () and bool(still.check([], AROUND)) == bool(
         whole.check([0.7, 1.0, at["grip"]], AROUND)

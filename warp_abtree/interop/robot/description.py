@@ -17,7 +17,6 @@ from warp_abtree.state.poses import check_poses
 
 JOINT_KINDS = {"fixed": int(forward.FIXED), "revolute": int(forward.REVOLUTE), "prismatic": int(forward.PRISMATIC)}
 
-
 # What a configuration sets of a joint with several values, as "joint/x" and so on; of a floating one as URDF's xyz rpy.
 COORDINATES = {"planar": ("x", "y", "angle"), "floating": ("x", "y", "z", "roll", "pitch", "yaw")}
 

@@ -101,8 +101,8 @@ class Robot:
 
         Joints may be fixed, revolute, continuous, prismatic, and mimic others; planar, floating and free ones have
         values "joint/x" and so on (`description.COORDINATES`). Of URDF, revolute and prismatic ones must have limits, 0
-        where one of two is not given. Tested against one another are all links but those that are
-        rigidly joined, that a joint joins, or that the file or the SRDF excludes. Of MJCF, "collision" has MuJoCo's
+        where one of two is not given. Tested against one another are all links but those that are rigidly joined, that
+        a joint joins, a floating one apart, or that the file or the SRDF excludes. Of MJCF, "collision" has MuJoCo's
         pairs: by contype, conaffinity, `contact/exclude` and `contact/pair`, and links on a joint are tested against
         what it hangs on where that stands still, or with `filterparent` disabled. Meshes of a URDF are mirrored by
         negative scales; those of Collada are scaled by their unit to meters, their up axis is ignored, as in RViz.
@@ -200,13 +200,10 @@ class Robot:
         touched, pairs = self._find_links(touches, "touches"), check_pairs(self.pairs, len(self.models))
         description = self.description.with_model(name, model, link, read_pose(pose, "pose"))
         body = description.bodies()[list(description.links.values())]
-        tested = (body[self.model_link] != body[-1]) & ~np.isin(self.model_link, touched)
-        added = [(k, len(self.models)) for k in np.flatnonzero(tested)]
+        tested = np.flatnonzero((body[self.model_link] != body[-1]) & ~np.isin(self.model_link, touched))
+        self.pairs = np.concatenate([pairs, np.column_stack([tested, np.full(len(tested), len(self.models))])])
+        self.models = [*self.models, model]
         self._describe(description)
-        self.models, self.pairs = (
-            [*self.models, model],
-            np.concatenate([pairs, np.array(added, np.int64).reshape(-1, 2)]),
-        )
 
     def detach(self, name: str):
         """Take an attached model away; raise ValueError if there is none, or others are attached to it."""
@@ -351,12 +348,11 @@ class Robot:
             shape = tuple(numbers.shape)
             raise ValueError(f"{what}: shape {shape}, not (c, {width}) or ({width},), a value of each joint")
         is_one = len(numbers.shape) == 1
-        if is_one:
-            numbers = numbers.reshape((1, width))
-        if len(numbers) == 0:
+        rows = numbers.reshape((1, width)) if is_one else numbers
+        if len(rows) == 0:
             return wp.empty((0, width), dtype=wp.float64, device=self.device), False
-        is_placed = isinstance(numbers, wp.array)
-        rows = numbers if is_placed else wp.array(numbers, dtype=wp.float64, device=self.device)
+        if not isinstance(rows, wp.array):
+            rows = wp.array(rows, dtype=wp.float64, device=self.device)
         if fault := self._find_fault(rows, limits):
             hint = " (limits=False takes it)" if "outside" in fault[1] else ""
             raise ValueError(f"{what}: {what[:-1]} {fault[0]} has {fault[1]}{hint}")
