@@ -199,7 +199,8 @@ def test_a_query_is_captured_and_says_when_room_was_short(arm, device, monkeypat
     "bad, message",
     [
         (np.zeros((3, 3)), r"shape \(3, 3\), not \(c, 4\)"),
-        (np.zeros(4), r"shape \(4,\)"),
+        (np.zeros(3), r"shape \(3,\), not \(c, 4\) or \(4,\)"),
+        (np.float64(0.0), r"shape \(\)"),
         ([[0, 0, 0, 0], [0, np.nan, 0, 0]], "configuration 1 has nan for joint 'bend'"),
         ([[0, 0, 0, 0], [0, 3, 0, 0]], "configuration 1 has 3 for joint 'bend', outside -2.8 .. 2.8"),
         ("x", "configurations"),
@@ -276,8 +277,7 @@ def test_a_mounted_link_without_a_mesh_takes_those_fixed_to_it(device):
     rows = np.array([[0.0, 0, 0.05, 0]])
     assert ab.Robot(made, device, ["base"]).check(rows, ground)[0]
     assert not ab.Robot(made, device, ["world"]).check(rows, ground)[0]
-    with pytest.warns(RuntimeWarning, match="no mesh is fixed to the link 'eye'"):
-        assert ab.Robot(made, device, ["eye"]).check(rows, ground)[0]
+    refused(ValueError, "mounted: no mesh is fixed to the link .eye.", ab.Robot, made, device, ["eye"])
 
 
 def test_a_robot_is_copied_and_pickled(arm):

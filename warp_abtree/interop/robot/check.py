@@ -8,7 +8,7 @@ import warp as wp
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.upload import struct_of
-from warp_abtree.interop.robot.link_query import LinkDistances, LinkHits, LinkRequest
+from warp_abtree.interop.robot.link_query import LinkDistances, LinkHits, LinkPairs, LinkRequest
 from warp_abtree.interop.robot.surroundings import RobotBatch
 from warp_abtree.kernels.robot.link_pairs import Parts
 from warp_abtree.query.request import CapacityError
@@ -77,7 +77,11 @@ class RobotQuery(DeviceMemory):
         request = make_link_request(robot, made, room)
         self._around, self._models = made.count, len(robot.models)
         given = made.batch, request, max(1, PAIRS_GUESS * room)
-        self._links: Any = LinkDistances(*given) if output == "distance" else LinkHits(*given, output == "within")
+        kinds: dict[str, Any] = {"distance": LinkDistances, "pairs": LinkPairs}
+        self._links: Any = kinds[output](*given) if output in kinds else LinkHits(*given, output == "within")
+        told = map(around.name, range(made.count)) if made.count and output in kinds else ()
+        # Of models of the robot, of what surrounds it, and of -1.
+        self._names = np.array([*[robot.link_names[k] for k in robot.model_link], *told, ""])
         self.nearest = self._links.nearest
         self.configurations, self._chunk = self._links.configurations, self._links.chunk
         self.hit = self._chunk.hit
@@ -105,26 +109,41 @@ class RobotQuery(DeviceMemory):
         if self._links.make_room_for(pairs, uncertain):
             raise CapacityError(f"{pairs} pairs of objects, {uncertain} uncertain ones of faces; launch again")
 
-    def ask(self, rows: wp.array, beyond: float = np.inf) -> np.ndarray:
+    def ask(self, rows: wp.array, beyond: float = np.inf) -> np.ndarray | list:
         """Return the answers of configurations, device rows (c, n), see `Robot.check`. Waits for the device."""
         self.take_poses()
-        answers = np.empty(len(rows), bool if self.output == "any" else NEAREST_ROWS)
+        nearest, listed = np.dtype([*NEAREST_ROWS.descr, ("names", self._names.dtype, 2)]), []
+        answers = np.empty(len(rows), nearest if self.output == "distance" else bool)
         for start in range(0, len(rows), self.room):
             count = min(self.room, len(rows) - start)
             if self.output == "distance":
                 self._links.most = beyond
             self._run(rows, start, count)
             part = answers[start : start + count]
+            if self.output == "pairs":
+                listed += self._list_pairs(count)
+                continue
             if self.output == "any":
                 part[:] = self.hit[:count].numpy() != 0
                 continue
             for name in ("distance", "points", "faces", "pair"):
                 part[name] = getattr(self.nearest, name)[:count].numpy()
-            # Objects as models of the robot, and what surrounds it after these.
-            pairs = part["pair"]
-            own = np.where(pairs < self._around, pairs + self._models, (pairs - self._around) % self._models)
-            part["pair"] = np.where(pairs < 0, -1, own)
-        return answers
+            part["pair"] = np.where(part["pair"] < 0, -1, self._number(part["pair"]))
+            part["names"] = self._names[part["pair"]]
+        return listed if self.output == "pairs" else answers
+
+    def _number(self, objects) -> np.ndarray:
+        """Return objects as indices of models of the robot, and what surrounds it after these."""
+        return np.where(objects < self._around, objects + self._models, (objects - self._around) % self._models)
+
+    def _list_pairs(self, count) -> list[list[tuple[str, str]]]:
+        """Return the pairs of names that intersect at each of the configurations of the last launch."""
+        pairs, names = np.concatenate(self._links.found), self._names.tolist()
+        rows: list[set] = [set() for _ in range(count)]
+        places = (pairs[:, 0] - self._around) // self._models
+        for place, (a, b) in zip(places.tolist(), np.sort(self._number(pairs)).tolist()):
+            rows[place].add((names[a], names[b]))
+        return [sorted(row) for row in rows]
 
     def _run(self, rows, first, count):
         self._links.active = count

@@ -143,6 +143,29 @@ class LinkHits(LinkQuery):
         wp.launch(answers.note_hit_kernel, len(query.pairs), inputs, device=self.device)
 
 
+class LinkPairs(LinkHits):
+    """Which parts intersect at each configuration: read by the host after each stage, so that no graph captures it.
+
+    Attributes:
+        found: Pairs of objects that intersect, a part first, arrays (k, 2).
+    """
+
+    found: list[np.ndarray]
+
+    def __init__(self, batch: Batch, request: LinkRequest, capacity: int):
+        super().__init__(batch, request, capacity, False)
+
+    def _begin(self):
+        super()._begin()
+        self.found = []
+
+    def _note(self, found):
+        super()._note(found)
+        self.chunk.hit.zero_()  # later stages are asked, too
+        pairs = self.query.pairs.numpy()[: self.query.pair_count.numpy()[0]]
+        self.found.append(pairs[self.query.hits.any_hit.numpy()[: len(pairs)] != 0])
+
+
 class LinkDistances(LinkQuery):
     """How far apart the nearest parts of each configuration are, or a part and its surroundings, and where.
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
+from warp_abtree.checks.quaternions import matrices_of
 from warp_abtree.interop.robot.description import (
     Description,
     Part,
@@ -42,7 +43,9 @@ def read_mjcf(path: Path, geometry: str) -> Description:
     check_names(names, "bodies", path)
     values = _joint_values(mujoco, model, path)
     for j in range(model.njnt):
-        if values[j] == (model.joint(j).name or f"joint {j}", 1.0, 0.0):
+        if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
+            description.add_coordinates(values[j][0], "floating")
+        elif values[j] == (model.joint(j).name or f"joint {j}", 1.0, 0.0):
             low, high = model.jnt_range[j].tolist()
             description.joints[values[j][0]] = (low, high) if model.jnt_limited[j] else (-math.inf, math.inf)
     for b, name in enumerate(names):
@@ -66,8 +69,8 @@ def _joint_values(mujoco, model, path) -> list[tuple[str, float, float]]:
     values, leads = [(name, 1.0, 0.0) for name in names], {}
     for j, name in enumerate(names):
         kind = mujoco.mjtJoint(int(model.jnt_type[j])).name[len("mjJNT_") :].lower()
-        if kind not in MJCF_JOINTS:
-            raise RobotError(f"{path}: joint {name!r} is {kind}; hinge and slide ones are supported")
+        if kind not in (*MJCF_JOINTS, "free"):
+            raise RobotError(f"{path}: joint {name!r} is {kind}; hinge, slide and free ones are supported")
     for e, kind in _equalities(mujoco, model):
         if kind != "joint":
             continue
@@ -129,14 +132,8 @@ def _warn_of_closures(mujoco, model, path):
 
 def _pose(position, quaternion=(1.0, 0.0, 0.0, 0.0)) -> np.ndarray:
     """Return the transform of a position and a quaternion w x y z."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    matrix[:3, 3] = position
+    matrix[:3, :3], matrix[:3, 3] = matrices_of([np.roll(quaternion, -1)])[0], position
     return matrix
 
 
@@ -147,9 +144,12 @@ def _add_body(mujoco, model, b, description, names, values, path) -> int:
     anchor = np.zeros(3)
     first = int(model.body_jntadr[b])
     for j in range(first, first + int(model.body_jntnum[b])):
+        joint, scale, offset = values[j]
+        if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:  # the body's pose in the world, as in qpos
+            description.add_joint_frames(parent, np.eye(4), joint, "floating")
+            continue
         origin = origin @ _pose(model.jnt_pos[j] - anchor)
         anchor = model.jnt_pos[j]
-        joint, scale, offset = values[j]
         start = float(model.qpos0[model.jnt_qposadr[j]])
         kind = MJCF_JOINTS[mujoco.mjtJoint(int(model.jnt_type[j])).name[len("mjJNT_") :].lower()]
         axis = unit_axis(model.jnt_axis[j], f"{path}: joint {j}")

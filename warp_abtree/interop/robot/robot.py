@@ -1,7 +1,8 @@
 """`Robot`: the links of a URDF or MJCF file, posed and checked at many configurations.
 
-A configuration holds a value of each of `joint_names` [rad, or the file's unit of length]. Frames are those of the
-file: poses of links are in that of its root, and what surrounds the robot is placed in it.
+A configuration holds a value of each of `joint_names` [rad, or the file's unit of length]: one is of shape (n,), many
+(c, n), and answers about one have no leading axis. Poses of links are in the world, in which `base` places the frame of
+the file's root, and what surrounds the robot its objects.
 """
 
 from pathlib import Path
@@ -9,20 +10,26 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import check_device, flag, is_device_array, to_numpy, whole_number, wrap_array
+from warp_abtree.checks.arguments import (
+    check_device,
+    finite_array,
+    flag,
+    is_device_array,
+    to_numpy,
+    whole_number,
+    wrap_array,
+)
 from warp_abtree.interop.robot.check import RobotQuery, check_edges
-from warp_abtree.interop.robot.description import Description, RobotError
-from warp_abtree.interop.robot.mjcf import read_mjcf
-from warp_abtree.interop.robot.surroundings import make_surroundings
-from warp_abtree.interop.robot.urdf import apply_srdf, read_urdf
+from warp_abtree.interop.robot.description import Description, RobotError, read_pose
+from warp_abtree.interop.robot.files import read_robot
+from warp_abtree.interop.robot.surroundings import STILL, make_surroundings
 from warp_abtree.kernels.robot import forward
-from warp_abtree.model.files.found import warn_caller
 from warp_abtree.model.model import Model
 from warp_abtree.query.stages.distance import check_beyond
+from warp_abtree.scene.objects import check_models, check_object_names
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.batch import check_pairs
 
-ENDINGS = {".urdf": read_urdf, ".xml": read_mjcf, ".mjcf": read_mjcf}
 # Configurations of a launch: fewer where few are given.
 ROOMS = {"cpu": (16, 256, 4096), "cuda": (1024, 8192, 65536)}
 # Stretches of an edge at a time, for the room of a chunk.
@@ -37,11 +44,12 @@ class Robot:
         joint_names: Names of the joints that a configuration sets, in its order.
         limits: Least and greatest value of each, float64 (n, 2); infinite where there is none.
         link_names: Names of all links, in the order of `forward`.
+        attached: Names of those of them that are attached models.
         models: `Model` of each part: the mesh of a link, in the link's frame.
         model_link: Index into `link_names` of each model, int (m,).
         pairs: Pairs of models that are tested against one another, int (p, 2).
         mounted: Indices into `link_names` of the links that are not tested against what surrounds the robot.
-        description: What the file says, `warp_abtree.interop.robot.description.Description`.
+        description: What it is made of, `warp_abtree.interop.robot.description.Description`.
 
     `pairs` and `mounted` may be set: each call goes by what they are then. A copy, or what is unpickled, is made anew
     from the description, on the same device, with `pairs` and `mounted`.
@@ -49,28 +57,52 @@ class Robot:
 
     def __init__(self, description: Description, device=None, mounted=()):
         self.device = Scene(device).device
-        self.description = description
-        self.joint_names, self.link_names = tuple(description.joints), tuple(description.links)
-        self.limits = np.array(list(description.joints.values()), np.float64).reshape(-1, 2)
         if not description.parts:
             raise RobotError("the robot has no link with a mesh")
         # Only the finest LOD is asked, so there is nothing to collapse.
-        meshes = [part.mesh for part in description.parts]
-        self.models = [Model.load(mesh, base_faces=len(mesh.faces)) for mesh in meshes]
-        self.model_link = np.array([part.link for part in description.parts])
+        self.models = [
+            part.mesh if isinstance(part.mesh, Model) else Model.load(part.mesh, base_faces=len(part.mesh.faces))
+            for part in description.parts
+        ]
         self.pairs = np.array(description.allowed_pairs(), np.int64).reshape(-1, 2)
-        self.mounted = self._find_mounted(mounted)
+        self._describe(description)
+        self.mounted: list[int] = []
+        body = description.bodies()[list(description.links.values())]
+        for k in self._find_links(mounted, "mounted"):
+            fixed = [k] if k in self.model_link else np.flatnonzero(body == body[k]).tolist()
+            if not np.isin(fixed, self.model_link).any():
+                raise ValueError(f"mounted: no mesh is fixed to the link {self.link_names[k]!r}")
+            self.mounted += [link for link in fixed if link not in self.mounted]
+
+    def _describe(self, description: Description):
+        """Go by a description from now on; queries are made anew."""
+        self.description = description
+        self.joint_names, self.link_names = tuple(description.joints), tuple(description.links)
+        self.limits = np.array(list(description.joints.values()), np.float64).reshape(-1, 2)
+        self.attached, self.model_link = description.attached(), np.array([part.link for part in description.parts])
         self._chain = description.make_chain(self.device)
         self._links = wp.array(np.array(list(description.links.values()), np.int32), device=self.device)
         self._kept: dict[tuple, RobotQuery] = {}
 
     @classmethod
-    def load(cls, path, geometry="collision", device=None, mounted=(), srdf=None, neutral=None, strict=True) -> "Robot":
+    def load(
+        cls,
+        path,
+        geometry="collision",
+        device=None,
+        mounted=(),
+        srdf=None,
+        neutral=None,
+        strict=True,
+        base=STILL,
+        locked=None,
+    ) -> "Robot":
         """Load a robot from a URDF (.urdf, by yourdfpy) or MJCF file (.xml, by MuJoCo).
 
-        Joints may be fixed, revolute, continuous, prismatic, and mimic others. Of URDF, revolute and prismatic ones
-        must have limits, 0 where one of two is not given. Tested against one another are all links but those that are
-        rigidly joined, that a joint joins, or that the file or the SRDF excludes. Of MJCF, "collision" has MuJoCo's
+        Joints may be fixed, revolute, continuous, prismatic, and mimic others; planar, floating and free ones have
+        values "joint/x" and so on (`description.COORDINATES`). Of URDF, revolute and prismatic ones must have limits, 0
+        where one of two is not given. Tested against one another are all links but those that are rigidly joined, that
+        a joint joins, a floating one apart, or that the file or the SRDF excludes. Of MJCF, "collision" has MuJoCo's
         pairs: by contype, conaffinity, `contact/exclude` and `contact/pair`, and links on a joint are tested against
         what it hangs on where that stands still, or with `filterparent` disabled. Meshes of a URDF are mirrored by
         negative scales; those of Collada are scaled by their unit to meters, their up axis is ignored, as in RViz.
@@ -80,12 +112,14 @@ class Robot:
                 are the geoms of groups 0 to 2, and meshes have vertices in float32, as MuJoCo compiles them.
             device: Warp device; None for Warp's default.
             mounted: Names of links that are never tested against what surrounds the robot, as a base that stands on it.
-                One without a mesh stands for all links that are rigidly fixed to it; RuntimeWarning if none has one.
+                One without a mesh stands for all links that are rigidly fixed to it, of which one must have one.
             srdf: Path of an SRDF file: pairs that `disable_collisions` names are excluded, others that
                 `enable_collisions` names are tested, whatever else holds, and of the rest those are excluded with a
                 link of `disable_default_collisions`.
             neutral: Configuration in which links that intersect are excluded, too; None for none.
             strict: Whether to refuse an SRDF that names links which the robot has not, rather than warn.
+            base: Pose of the file's root in the world, 7 numbers or a rigid (4, 4), as for `Scene.add`.
+            locked: Values of joints that are fixed at them, by name, and no longer of a configuration.
 
         Warns of what ties links beside their joints and is not enforced: of MJCF `equality` other than between joints,
         and limits of tendons; of URDF joints of Gazebo's and Drake's elements. And of what is not read: macros of xacro
@@ -96,41 +130,37 @@ class Robot:
             ValueError: A file that is missing or unreadable, or has no mesh of this geometry, a joint or shape of
                 another kind, a bad option; the message names it.
         """
-        path = Path(path)
-        if path.suffix.lower() not in ENDINGS:
-            raise RobotError(f"{path}: a robot is a .urdf or .xml file")
-        if geometry not in ("collision", "visual"):
-            raise ValueError(f"geometry {geometry!r} is neither 'collision' nor 'visual'")
-        for file in (path, *([] if srdf is None else [Path(srdf)])):
-            if not file.is_file():
-                raise RobotError(f"{file}: no such file")
-        description = ENDINGS[path.suffix.lower()](path, geometry)
-        if not description.parts:
-            other = "visual" if geometry == "collision" else "collision"
-            raise RobotError(f"{path}: no link has a mesh of geometry={geometry!r}; it may have some of {other!r}")
-        if srdf is not None:
-            apply_srdf(description, Path(srdf), flag(strict, "strict"))
+        base = read_pose(base, "base")
+        description = read_robot(Path(path), geometry, None if srdf is None else Path(srdf), flag(strict, "strict"))
+        description.place(base)
         robot = cls(description, device, mounted)
+        robot._lock({} if locked is None else locked)
         if neutral is not None:
             robot.exclude_meeting(neutral)
         return robot
 
-    def _find_mounted(self, names) -> list[int]:
-        """Return the links of names, and in the place of one without a mesh all that are rigidly fixed to it."""
+    def _lock(self, values):
+        """Fix joints at values, by name."""
+        if not isinstance(values, dict):
+            raise TypeError(f"locked: a {type(values).__name__} is no dict of values by the names of joints")
+        row = np.clip(0.0, *self.limits.T)
+        for name, value in values.items():
+            if name not in self.joint_names:
+                raise ValueError(f"locked: a configuration has no joint {name!r}")
+            row[self.joint_names.index(name)] = finite_array(value, f"locked joint {name!r}", ())
+        if fault := self._find_fault(wp.array(row[None], dtype=wp.float64, device=self.device), True):
+            raise ValueError(f"locked: {fault[1]}")
+        self.description.lock({name: float(row[self.joint_names.index(name)]) for name in values})
+        self._describe(self.description)
+
+    def _find_links(self, names, what: str) -> list[int]:
+        """Return the indices of links of names."""
         if isinstance(names, str):
-            raise TypeError(f"mounted: {names!r} is a name, not a list of names of links")
-        names = list(names)
-        unknown = set(names) - set(self.link_names)
-        if unknown:
-            raise ValueError(f"mounted: the robot has no link {sorted(unknown)[0]!r}")
-        body = self.description.bodies()[list(self.description.links.values())]
-        found: dict[int, None] = {}
-        for k in map(self.link_names.index, names):
-            fixed = [k] if k in self.model_link else np.flatnonzero(body == body[k]).tolist()
-            if not np.isin(fixed, self.model_link).any():
-                warn_caller(f"mounted: no mesh is fixed to the link {self.link_names[k]!r}: naming it changes nothing")
-            found |= dict.fromkeys(fixed)
-        return list(found)
+            raise TypeError(f"{what}: {names!r} is a name, not a list of names of links")
+        for name in names:
+            if name not in self.link_names:
+                raise ValueError(f"{what}: the robot has no link {name!r}")
+        return [self.link_names.index(name) for name in names]
 
     def __reduce__(self):
         kept = {"pairs": self.pairs, "mounted": self.mounted}
@@ -142,19 +172,76 @@ class Robot:
 
     def exclude_meeting(self, configuration):
         """Test models no more that intersect at a configuration, (n,), as neighbours may. Waits for the device."""
-        poses = self.forward(np.asarray(configuration)[None]).numpy()[0]
         scene = Scene(self.device)
-        scene.add_many(self.models, poses[self.model_link])
+        self.add_to(scene, configuration)
         pairs = check_pairs(self.pairs, len(self.models))
         self.pairs = pairs[~scene.intersect(pairs).any]
 
+    def attach(self, model: Model, link: str, pose=STILL, name: str | None = None, touches=()):
+        """Fix a model to a link that holds it: it is the last link then, and tested at its finest LOD.
+
+        That is against what surrounds the robot and all links but those that are rigidly fixed to the one that holds
+        it. Operators of `query` go by what was attached when they were made.
+
+        Args:
+            pose: Of the model in the link's frame, 7 numbers or a rigid (4, 4).
+            name: Of the new link; None for the model's.
+            touches: Names of links that it is not tested against, as the fingers that grip it.
+
+        Raises:
+            TypeError, ValueError: Bad arguments, a name that a link has; nothing is changed.
+        """
+        check_models(model, 1)
+        name = model.name if name is None else name
+        check_object_names([name], 1)
+        if name in self.link_names:
+            raise ValueError(f"attach: the robot has a link {name!r} already")
+        self._find_links([link], "attach")
+        touched, pairs = self._find_links(touches, "touches"), check_pairs(self.pairs, len(self.models))
+        description = self.description.with_model(name, model, link, read_pose(pose, "pose"))
+        body = description.bodies()[list(description.links.values())]
+        tested = np.flatnonzero((body[self.model_link] != body[-1]) & ~np.isin(self.model_link, touched))
+        self.pairs = np.concatenate([pairs, np.column_stack([tested, np.full(len(tested), len(self.models))])])
+        self.models = [*self.models, model]
+        self._describe(description)
+
+    def detach(self, name: str):
+        """Take an attached model away; raise ValueError if there is none, or others are attached to it."""
+        description, pairs = self.description.without_model(name), check_pairs(self.pairs, len(self.models))
+        link = self.link_names.index(name)
+        k = self.model_link.tolist().index(link)
+        self.mounted = [other - (other > link) for other in self.mounted if other != link]
+        self.models, pairs = self.models[:k] + self.models[k + 1 :], pairs[(pairs != k).all(1)]
+        self.pairs = pairs - (pairs > k)
+        self._describe(description)
+
+    def add_to(self, scene: Scene, configuration) -> np.ndarray:
+        """Add the links at a configuration, (n,), to a scene, and return their indices there, one of each of `models`.
+
+        Objects have the names of links; pairs that the robot does not test are filtered there.
+
+        Raises:
+            TypeError, ValueError: No scene, or a bad configuration; nothing is added.
+        """
+        if not isinstance(scene, Scene):
+            raise TypeError(f"add_to: a {type(scene).__name__} is no Scene")
+        poses = self.forward(configuration)
+        if poses.ndim != 1:
+            raise ValueError(f"add_to: {len(poses)} configurations, not one of shape ({len(self.joint_names)},)")
+        pairs, names = check_pairs(self.pairs, len(self.models)), [self.link_names[k] for k in self.model_link]
+        added = scene.add_many(self.models, poses.numpy()[self.model_link], names=names)
+        tested = np.eye(len(added), dtype=bool)
+        tested[tuple(pairs.T)] = tested[tuple(pairs.T[::-1])] = True
+        scene.filter(added[np.argwhere(~tested)])
+        return added
+
     def forward(self, configurations, limits=True) -> wp.array:
-        """Return the poses of all links, device mat44d (c, links), in the frame of the root.
+        """Return the poses of all links in the world, device mat44d (c, links), or (links,) of one configuration.
 
         Waits for the device once, for what is refused.
 
         Args:
-            configurations: (c, n) of any framework; float64 on the robot's GPU is read where it lies.
+            configurations: (c, n) or (n,) of any framework; float64 on the robot's GPU is read where it lies.
             limits: Whether to refuse configurations out of limits. What is beyond a limit by no more than 2^-51 of the
                 greater one, 2^-22 if it is a float32 number, as rounding puts it there, is within, and taken as it is.
 
@@ -162,7 +249,7 @@ class Robot:
             ValueError: Another shape, a number that is not finite, one out of its limits; the first is named.
         """
         check_device(self.device, "Robot.forward")
-        rows = self._take(configurations, limits)
+        rows, is_one = self._take(configurations, limits)
         frames, shape = forward.Frames(), (len(rows), len(self.description.frames))
         frames.rotation = wp.empty(shape, dtype=wp.mat33d, device=self.device)
         frames.position = wp.empty(shape, dtype=wp.vec3d, device=self.device)
@@ -170,9 +257,9 @@ class Robot:
         if len(rows):
             wp.launch(forward.forward_kernel, len(rows), [self._chain, rows, frames], device=self.device)
             wp.launch(forward.write_link_kernel, poses.shape, [self._links, frames, poses], device=self.device)
-        return poses
+        return poses[0] if is_one else poses
 
-    def check(self, configurations, world=None, output="any", beyond=None, limits=True):
+    def check(self, configurations, world=None, output="any", beyond=None, limits=True, which=False):
         """Check whether parts intersect, each other or the world, at each configuration, or how far they are apart.
 
         Exactly, as `Scene.intersect`, for link poses as `forward` computes them. Waits for the device, once a chunk of
@@ -185,12 +272,15 @@ class Robot:
             output: "any" or "distance".
             beyond: For "distance", what is farther apart is infinitely far [world units].
             limits: Whether to refuse configurations out of limits.
+            which: Whether to return, of "any", the pairs that intersect.
 
         Returns:
-            For "any" bool (c,). For "distance" a structured array (c,) of distance, 0 where parts intersect; points (2,
-            3), nearest on a part of the robot and on what it is nearest to, and faces (2,) that they lie on; pair (2,):
-            the part's index into `models`, and that of the other one, or len(models) + object of the world. Where all
-            is beyond, points are NaN and the others -1.
+            For "any" bool (c,); with `which` a sorted list of pairs of names for each configuration, each pair once: a
+            link, and a later one or an object of the world (`Scene.name`). For "distance" a structured array (c,) of
+            distance, 0 where parts intersect; points (2, 3), nearest on a part of the robot and on what it is nearest
+            to, and faces (2,) that they lie on; pair (2,): the part's index into `models`, and that of the other one,
+            or len(models) + object of the world; and their names (2,). Where all is beyond, points are NaN, names
+            empty, and the others -1.
 
         Raises:
             TypeError, ValueError: Bad configurations, the first of which is named, a bad world or option.
@@ -199,10 +289,13 @@ class Robot:
             raise ValueError(f"output {output!r} is neither 'any' nor 'distance'")
         if beyond is not None and output != "distance":
             raise ValueError(f"beyond means nothing for output {output!r}")
+        if flag(which, "which") and output != "any":
+            raise ValueError(f"which means nothing for output {output!r}")
         far = float(check_beyond(beyond))
         check_device(self.device, "Robot.check (RobotQuery.launch can)")
-        rows = self._take(configurations, limits)
-        return self._find_query(world, output, len(rows)).ask(rows, far)
+        rows, is_one = self._take(configurations, limits)
+        answers = self._find_query(world, "pairs" if which else output, len(rows)).ask(rows, far)
+        return answers[0] if is_one else answers
 
     def check_edges(self, starts, ends, world=None, tolerance=1e-3, limits=True) -> np.ndarray:
         """Find when parts first touch on edges of a planner: all joints move evenly from start to end, in unit time.
@@ -224,14 +317,15 @@ class Robot:
             TypeError, ValueError: As `check`.
         """
         check_device(self.device, "Robot.check_edges")
-        first, last = (self._take(given, limits, what).numpy() for given, what in ((starts, "starts"), (ends, "ends")))
+        (first, is_one), (last, also) = self._take(starts, limits, "starts"), self._take(ends, limits, "ends")
         if len(first) != len(last):
             raise ValueError(f"ends: {len(last)} given for {len(first)} starts")
         tolerance = to_numpy(tolerance, "tolerance")
         if tolerance.shape != () or not 2.0**-30 <= tolerance < 1:
             raise ValueError(f"tolerance: {tolerance} is no number of 2^-30 or more, below 1")
         query = self._find_query(world, "within", STRETCHES * len(first))
-        return check_edges(query, first, last, float(tolerance))
+        rows = check_edges(query, first.numpy(), last.numpy(), float(tolerance))
+        return rows[0] if is_one and also else rows
 
     def query(self, world=None, output="any", room=4096) -> RobotQuery:
         """Return an operator for a fixed number of configurations, which a CUDA graph can capture: `RobotQuery`."""
@@ -241,37 +335,42 @@ class Robot:
         room = whole_number(room, "room", 1, 2**22)
         return RobotQuery(self, make_surroundings(world, self.device)[0], output, room)
 
-    def _take(self, configurations, limits, what="configurations") -> wp.array:
-        """Return configurations as device rows, float64 (c, n), checked. Waits for the device."""
+    def _take(self, configurations, limits, what="configurations") -> tuple[wp.array, bool]:
+        """Return configurations as checked device rows, float64 (c, n), and whether one was given. Waits for it."""
         limits = flag(limits, "limits")
         width = len(self.joint_names)
         given = wrap_array(configurations, what) if is_device_array(configurations) else None
         if given is not None and given.device == self.device and given.dtype == wp.float64:
-            rows = given if given.is_contiguous else given.contiguous()
+            numbers = given if given.is_contiguous else given.contiguous()
         else:
-            numbers = np.ascontiguousarray(to_numpy(configurations, what), np.float64)
-            dims = numbers.ndim == 2
-            rows = wp.array(numbers, dtype=wp.float64, device=self.device) if dims and len(numbers) else numbers
-        if len(rows.shape) != 2 or rows.shape[1] != width:
-            raise ValueError(f"{what}: shape {tuple(rows.shape)}, not (c, {width}), a value of each joint")
+            numbers = np.asarray(to_numpy(configurations, what), np.float64, order="C")
+        if len(numbers.shape) not in (1, 2) or numbers.shape[-1] != width:
+            shape = tuple(numbers.shape)
+            raise ValueError(f"{what}: shape {shape}, not (c, {width}) or ({width},), a value of each joint")
+        is_one = len(numbers.shape) == 1
+        rows = numbers.reshape((1, width)) if is_one else numbers
         if len(rows) == 0:
-            return wp.empty((0, width), dtype=wp.float64, device=self.device)
+            return wp.empty((0, width), dtype=wp.float64, device=self.device), False
+        if not isinstance(rows, wp.array):
+            rows = wp.array(rows, dtype=wp.float64, device=self.device)
+        if fault := self._find_fault(rows, limits):
+            hint = " (limits=False takes it)" if "outside" in fault[1] else ""
+            raise ValueError(f"{what}: {what[:-1]} {fault[0]} has {fault[1]}{hint}")
+        return rows, is_one
+
+    def _find_fault(self, rows, limits) -> tuple[int, str] | None:
+        """Return the first of device rows that has a bad value, and what is wrong with it. Waits for the device."""
         first = wp.full(1, int(forward.NO_BAD_NUMBER), dtype=wp.int64, device=self.device)
         inputs = [int(limits), len(rows), self._chain, rows, first]
         wp.launch(forward.check_configuration_kernel, len(rows), inputs, device=self.device)
         bad = int(first.numpy()[0])
-        if bad != int(forward.NO_BAD_NUMBER):
-            self._refuse(rows, *divmod(bad, width), what)
-        return rows
-
-    def _refuse(self, rows, i, k, what):
-        """Raise ValueError about a value of a configuration that is none."""
+        if bad == int(forward.NO_BAD_NUMBER):
+            return None
+        i, k = divmod(bad, len(self.joint_names))
         value = float(rows[i : i + 1].numpy()[0, k])
-        told = f"{what}: {what[:-1]} {i} has {exact(value)} for joint {self.joint_names[k]!r}"
-        if not abs(value) < forward.ANGLE_MAX:
-            raise ValueError(told)
         low, high = map(exact, self.limits[k])
-        raise ValueError(f"{told}, outside {low} .. {high} (limits=False takes it)")
+        beyond = f", outside {low} .. {high}" if abs(value) < forward.ANGLE_MAX else ""
+        return i, f"{exact(value)} for joint {self.joint_names[k]!r}{beyond}"
 
     def _find_query(self, world, output, count) -> RobotQuery:
         """Return a query of a room for a number of configurations: the one of before if it is of the same."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.interop.robot.description import (
+    COORDINATES,
     Description,
     Part,
     RobotError,
@@ -26,6 +27,7 @@ from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.mesh import MeshError, load_mesh
 
 URDF_JOINTS = {"fixed": "fixed", "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+MOVING = {name for name, kind in URDF_JOINTS.items() if kind != "fixed"}  # of one value
 # Those of pairs, and what says nothing of them.
 SRDF_TAGS = (
     *("disable_collisions", "enable_collisions", "disable_default_collisions", "group", "group_state", "end_effector"),
@@ -50,7 +52,8 @@ def read_urdf(path: Path, geometry: str) -> Description:
         raise RobotError(f"{path}: not read as URDF ({told})") from None
     description, joints = Description(), {joint.child: joint for joint in robot.joints}
     names = [link.name for link in robot.links]
-    for what, given in (("links", names), ("joints", [joint.name for joint in robot.joints])):
+    coordinates = [f"{joint.name}/{name}" for joint in robot.joints for name in COORDINATES.get(joint.type, ())]
+    for what, given in (("links", names), ("joints", [joint.name for joint in robot.joints] + coordinates)):
         check_names(given, what, path)
     for joint in robot.joints:
         _check_joint(joint, joints, names, path)
@@ -58,9 +61,11 @@ def read_urdf(path: Path, geometry: str) -> Description:
     if len(roots) > 1:
         warn_caller(f"{path}: {', '.join(map(repr, roots[1:]))} hang on no joint, and are placed where {roots[0]!r} is")
     for joint in robot.joints:  # in the file's order, as configurations are
-        if joint.type != "fixed" and joint.mimic is None:
+        if joint.type in COORDINATES:
+            description.add_coordinates(joint.name, joint.type)
+        elif joint.type != "fixed" and joint.mimic is None:
             description.joints[joint.name] = _limits(joint, path)
-    values = {joint.name: _value_of(joint, robot.joints, path) for joint in robot.joints if joint.type != "fixed"}
+    values = {joint.name: _value_of(joint, robot.joints, path) for joint in robot.joints if joint.type in MOVING}
     for name in names:
         _add_link(name, description, joints, values, path)
 
@@ -83,8 +88,10 @@ def read_urdf(path: Path, geometry: str) -> Description:
 
 def _check_joint(joint, joints, names, path):
     where = f"{path}: joint {joint.name!r}"
-    if joint.type not in URDF_JOINTS:
-        raise RobotError(f"{where} is {joint.type}; fixed, revolute, continuous and prismatic ones are supported")
+    if joint.type not in (*URDF_JOINTS, *COORDINATES):
+        raise RobotError(f"{where} is {joint.type}; {', '.join((*URDF_JOINTS, *COORDINATES))} ones are supported")
+    if joint.type in COORDINATES and joint.mimic is not None:
+        raise RobotError(f"{where} is {joint.type}, and mimics another; one that does has one value")
     for end in (joint.parent, joint.child):
         if end not in names:
             raise RobotError(f"{where}: no link {end!r}")
@@ -112,8 +119,9 @@ def _value_of(joint, joints, path) -> tuple[str, float, float]:
     named = {other.name: other for other in joints}
     while joint.mimic is not None:
         source = joint.mimic.joint
-        if source not in named or source in seen or named[source].type == "fixed":
-            raise RobotError(f"{path}: joint {joint.name!r} mimics {source!r}, which is none that moves by itself")
+        if source not in named or source in seen or named[source].type not in MOVING:
+            told = f"{path}: joint {joint.name!r} mimics {source!r}"
+            raise RobotError(f"{told}, which is none of one value that moves by itself")
         by = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
         offset += scale * (0.0 if joint.mimic.offset is None else float(joint.mimic.offset))
         scale *= by
@@ -133,16 +141,20 @@ def _add_link(name, description, joints, values, path):
         above[name] = None
         name = joints[name].parent if name in joints else None
     for link in reversed(above):
-        frame, joint = RobotFrame(-1, np.eye(4)), joints.get(link)
-        if joint is not None:
+        joint = joints.get(link)
+        if joint is None:
+            description.frames.append(RobotFrame(-1, np.eye(4)))
+        else:
             where = f"{path}: joint {joint.name!r}"
-            origin = check_rigid(joint.origin, where)
-            frame = RobotFrame(description.links[joint.parent], origin, URDF_JOINTS[joint.type])
-            if joint.type != "fixed":
-                frame.joint, frame.scale, frame.offset = values[joint.name]
-                frame.axis = unit_axis((1.0, 0.0, 0.0) if joint.axis is None else joint.axis, where)
-        description.links[link] = len(description.frames)
-        description.frames.append(frame)
+            parent, origin = description.links[joint.parent], check_rigid(joint.origin, where)
+            given = (1.0, 0.0, 0.0) if joint.axis is None else joint.axis
+            axis = (0.0, 0.0, 1.0) if joint.type in ("fixed", "floating") else unit_axis(given, where)
+            if joint.type in COORDINATES:
+                description.add_joint_frames(parent, origin, joint.name, joint.type, axis)
+            else:
+                made = RobotFrame(parent, origin, URDF_JOINTS[joint.type], axis, *values.get(joint.name, ()))
+                description.frames.append(made)
+        description.links[link] = len(description.frames) - 1
 
 
 def _check_elements(path):

@@ -1,0 +1,133 @@
+"""Robots with a base pose and locked joints, asked about one configuration and many, against posed meshes in FCL."""
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from helpers import refused
+from helpers.robots import AROUND, MJCF, URDF, described_arm, pose_frames, random_configurations, write_arm
+from scipy.spatial.transform import Rotation
+
+import warp_abtree as ab
+
+BASE = (0.3, -0.2, 0.1, *Rotation.from_rotvec((0.2, -0.5, 1.1)).as_quat())
+
+
+def matrix_of(pose):
+    """Return a pose of 7 numbers as a matrix (4, 4)."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]
+    return matrix
+
+
+@pytest.fixture
+def arm(device):
+    return ab.Robot(described_arm(), device, mounted=["base"])
+
+
+@pytest.mark.parametrize("name, text, extra", [("arm.urdf", URDF, "yourdfpy"), ("arm.xml", MJCF, "mujoco")])
+def test_a_base_moves_the_robot_in_the_world(name, text, extra, tmp_path, device):
+    pytest.importorskip(extra)
+    path = write_arm(tmp_path, text, name)
+    still, base = ab.Robot.load(path, device=device), matrix_of(BASE)
+    rows = random_configurations(40, still.limits, seed=1)
+    expected, moved = base @ still.forward(rows).numpy(), [(model, base @ matrix_of(pose)) for model, pose in AROUND]
+    rounded = base.astype(np.float32)  # rigid within 1e-6 alone
+    for given, tolerance in ((BASE, 1e-14), (base, 1e-14), (rounded, 1e-6)):
+        placed = ab.Robot.load(path, device=device, base=given)
+        np.testing.assert_allclose(placed.forward(rows).numpy(), expected, atol=tolerance)
+        turned = placed.forward(rows[0]).numpy()[:, :3, :3]
+        np.testing.assert_allclose(
+            turned @ turned.transpose(0, 2, 1), np.tile(np.eye(3), (len(turned), 1, 1)), atol=1e-14
+        )
+    hit = still.check(rows, AROUND)
+    assert 3 < hit.sum() < 37
+    np.testing.assert_array_equal(placed.check(rows, moved), hit)
+    assert not np.array_equal(placed.check(rows, AROUND), hit)
+    times = [
+        robot.check_edges(rows[:9], rows[1:10], world)["time"] for robot, world in ((still, AROUND), (placed, moved))
+    ]
+    np.testing.assert_allclose(*times, atol=2e-3)
+    for bad, message in (
+        ((0, 0, 0), "base: shape"),
+        ((0, 0, 0, 0, 0, 0, 2), "base: pose 0"),
+        (2 * base, "base: matrix 0"),
+    ):
+        refused(ValueError, message, ab.Robot.load, path, device=device, base=bad)
+
+
+def test_locked_joints_stand_at_their_values(tmp_path, device):
+    pytest.importorskip("yourdfpy")
+    path = write_arm(tmp_path, URDF, "arm.urdf")
+    whole = ab.Robot.load(path, device=device)
+    at = {"grip": np.float32(0.1), "turn": 0.7}  # rounded up: within the limit of 0.1 all the same
+    locked = ab.Robot.load(path, device=device, locked=at, neutral=[0.0])
+    assert locked.joint_names == ("bend",) and locked.limits.tolist() == [[-2.8, 2.8]]
+    whole.exclude_meeting([0.7, 0, at["grip"]])
+    assert locked.pairs.tolist() == whole.pairs.tolist() and len(locked.pairs)
+    rows = random_configurations(60, locked.limits, seed=2)
+    full = np.column_stack([np.full(60, 0.7), rows[:, 0], np.full(60, at["grip"])])
+    np.testing.assert_array_equal(locked.forward(rows).numpy(), whole.forward(full).numpy())
+    hit = whole.check(full, AROUND)
+    assert 3 < hit.sum() < 57
+    np.testing.assert_array_equal(locked.check(rows, AROUND), hit)
+    edges = locked.check_edges(rows[:6], rows[1:7], AROUND)
+    np.testing.assert_array_equal(edges, whole.check_edges(full[:6], full[1:7], AROUND))
+    still = ab.Robot.load(path, device=device, locked=at | {"bend": 1.0})
+    assert still.joint_names == () and bool(still.check([], AROUND)) == bool(
+        whole.check([0.7, 1.0, at["grip"]], AROUND)
+    )
+    for bad, kind, message in (
+        ({"follow": 0.0}, ValueError, "locked: a configuration has no joint 'follow'"),
+        ({"mount": 0.0}, ValueError, "no joint 'mount'"),
+        ({"bend": 2.9}, ValueError, r"locked: 2.9 for joint 'bend', outside -2.8 .. 2.8$"),
+        ({"bend": np.nan}, ValueError, "locked joint 'bend': nan is not a finite number"),
+        ({"bend": [0, 1]}, ValueError, "locked joint 'bend'"),
+        ({"turn": 2.0**21}, ValueError, "locked: 2097152 for joint 'turn'$"),
+        (["bend"], TypeError, "locked: a list is no dict"),
+    ):
+        refused(kind, message, ab.Robot.load, path, device=device, locked=bad)
+
+
+def test_one_configuration_is_asked_as_one_of_many(arm, device):
+    rows = random_configurations(6, seed=3)
+    on_device = wp.array(rows[0], dtype=wp.float64, device=device)
+    hit, far = arm.check(rows, AROUND), arm.check(rows, AROUND, output="distance")
+    edges, poses = arm.check_edges(rows, rows[::-1], AROUND), arm.forward(rows).numpy()
+    for k, row in enumerate(rows):
+        for given in (row, row.tolist(), *([on_device] if k == 0 else [])):
+            assert arm.check(given, AROUND).shape == () and arm.check(given, AROUND) == hit[k]
+            np.testing.assert_array_equal(arm.check(given, AROUND, output="distance"), far[k])
+            np.testing.assert_array_equal(arm.forward(given).numpy(), poses[k])
+            assert arm.check_edges(given, rows[-1 - k], AROUND) == edges[k]
+    assert 0 < hit.sum() < 6 and arm.check(rows[:1]).shape == arm.check_edges(rows[0], rows[:1]).shape == (1,)
+    matrices = pose_frames(arm.description, rows[0])
+    np.testing.assert_allclose(arm.forward(rows[0]).numpy(), matrices, atol=1e-13)
+
+
+def test_a_robot_is_added_to_a_scene_where_it_stands(device):
+    arm, rows = ab.Robot(described_arm(), device), random_configurations(30, seed=4)
+    found = []
+    for row in rows:
+        scene = ab.Scene(device)
+        scene.add(*AROUND[0])
+        assert arm.add_to(scene, row).tolist() == [1, 2, 3, 4, 5, 6]
+        assert [scene.name(i) for i in range(1, 7)] == ["base", "upper", "fore", "left", "right", "flap"]
+        found.append(scene.intersect().any.any())
+    assert 3 < sum(found) < 27
+    np.testing.assert_array_equal(found, arm.check(rows, AROUND[:1]))
+    placed = ab.to_trimesh(scene, names=["ring", *map(scene.name, range(1, 7))])
+    for part, matrix in zip(arm.description.parts, pose_frames(arm.description, rows[-1])[arm.model_link]):
+        pose, geometry = placed.graph[arm.link_names[part.link]]
+        found, posed = (
+            trimesh.transform_points(v, m)
+            for v, m in ((placed.geometry[geometry].vertices, pose), (part.mesh.vertices, matrix))
+        )
+        np.testing.assert_allclose([found.min(0), found.max(0)], [posed.min(0), posed.max(0)], atol=1e-12)
+    for call, kind, message in (
+        (lambda: arm.add_to([], rows[0]), TypeError, "a list is no Scene"),
+        (lambda: arm.add_to(scene, rows), ValueError, r"30 configurations, not one of shape \(4,\)"),
+        (lambda: arm.add_to(scene, [0, 9, 0, 0]), ValueError, "9 for joint 'bend'"),
+    ):
+        refused(kind, message, call)
+    assert scene.object_count == 7
