@@ -3,8 +3,10 @@
 T is measured first: the median frame at the finest LODs, after the first second, over BREACH. On the CPU one core, and
 the CPU time of its thread, so that what else the machine does is left out.
 
-Then what control costs: a budget that the finest LODs keep makes the controller stay there, so that its frames have all
-of its cost and none of its gain.
+Then what an LOD changes of a frame: its stages at the finest and at the coarsest LODs, with all objects of the scenes.
+
+Last, what control costs: a budget that the finest LODs keep makes the controller stay there, so that its frames have
+all of its cost and none of its gain.
 """
 
 import contextlib
@@ -35,6 +37,8 @@ BREACH = 3.5  # how often the finest LODs take the budget
 CONTROLLED = ("focus", "herd", "rain", "worlds")
 CONTROLLED_OBJECTS = {"cpu": 200, "cuda": None}
 BUDGETS = (2.0, 0.5)
+# What an LOD changes of a frame: scenes, and frames of each.
+STAGED, STAGED_FRAMES = ("focus", "rain", "worlds"), 60
 CONTROLLERS = ("none", "coarsest", "predictive", "paper", "tolerance")
 
 
@@ -44,8 +48,9 @@ def run(device, quick=False, plots=None):
     budget_ms is T; for what is judged see `budget_report`. "none" has the finest LODs, "coarsest" the coarsest: no
     budget below can be held. plots is a folder for a figure a scene, None draws nothing.
 
-    Of rows with a ratio finest_ms is the median frame at the finest LODs, half of its runs before and half after those
-    under control; total_ms that under the controller, with the medians of its stages.
+    Rows with lods have the medians of all stages of the second half of the frames. Of rows with a ratio finest_ms is
+    the median frame at the finest LODs, half of its runs before and half after those under control; total_ms that under
+    the controller, with the medians of its stages.
     """
     device = wp.get_device(device)
     kind = "cuda" if device.is_cuda else "cpu"
@@ -64,6 +69,9 @@ def run(device, quick=False, plots=None):
                 runs[controller] = frame.history
             if plots is not None:
                 draw_runs(name, runs, budget, plots)
+        for name in STAGED:
+            loaded = read_scene(name, device, QUICK_OBJECTS if quick else None)
+            yield from find_stages(loaded, name, QUICK_FRAMES // 10 if quick else STAGED_FRAMES, options)
     frames = QUICK_FRAMES // 10 if quick else FRAMES
     for name in CONTROLLED:
         if name == "herd" and importlib.util.find_spec("pxr") is None:
@@ -123,6 +131,15 @@ def draw_runs(name, runs, budget, folder):
     print(tables.draw([figure | {"file": f"budget-{name}.svg"}], rows, folder), flush=True)
 
 
+def find_stages(loaded, name, frames, options):
+    """Yield a row at the finest LODs of a scene, and one at the coarsest."""
+    for lods in ("finest", "coarsest"):
+        rows = run_frames(loaded, frames, None, lods == "coarsest", options)
+        row = {"scene": name, "device": loaded.scene.device.name, "objects": loaded.scene.object_count, "lods": lods}
+        stages = {stage: [getattr(row, stage) for row in rows] for stage in (*STAGES, "total_ms")}
+        yield row | {"hits": float(np.median([row.hits for row in rows]))} | medians(stages)
+
+
 def compare(loaded, name, frames):
     """Yield a row a budget of one scene."""
     finest = run_frames(loaded, frames, None)
@@ -137,14 +154,14 @@ def compare(loaded, name, frames):
         yield row | {"error_mean": controlled[-1].error_mean, "ratio": total / stand}
 
 
-def run_frames(loaded, frames, budget):
-    """Run a scene from its start, at its finest LODs or under a budget [ms]; return the second half of its rows."""
+def run_frames(loaded, frames, budget, coarsest=False, options=None):
+    """Run a scene from its start, at fixed LODs or under a budget [ms]; return the second half of its rows."""
     scene = loaded.scene
-    scene.set_lods([scene.models[model].lod_max for model in scene.object_model])
+    scene.set_lods([0 if coarsest else scene.models[model].lod_max for model in scene.object_model])
     bodies = loaded.make_bodies()
     motion = loaded.motion if bodies is None else bodies.motion(loaded.motion)
     lods = None if budget is None else ab.PredictiveController(scene, budget, loaded.camera)
-    frame = ab.Frame(scene, motion, lods, "count", loaded.time_step)
+    frame = ab.Frame(scene, motion, lods, "count", loaded.time_step, **(options or {}))
     frame.warm_up()
     collect()
     return frame.run(frames)[frames // 2 :]

@@ -147,7 +147,11 @@ def check_budget(rows):
     assert {row["scene"] for row in controlled} >= {"focus", "rain", "worlds"}
     for row in controlled:
         assert row["ratio"] == pytest.approx(row["total_ms"] / row["finest_ms"], rel=0.01) and row["select_ms"] > 0
-    assert len(rows) == len(held) + len(controlled)
+    staged = [row for row in rows if "lods" in row]
+    assert [row["scene"] for row in staged[::2]] == list(budget.STAGED) and len(staged) == 2 * len(budget.STAGED)
+    for finest, coarsest in zip(staged[::2], staged[1::2]):
+        assert finest["hits"] >= coarsest["hits"] and finest["query_ms"] > 0 and finest["total_ms"] > finest["query_ms"]
+    assert len(rows) == len(held) + len(controlled) + len(staged)
     for row in held:
         assert row["judged"] == 3 and 0 <= row["within"] <= row["within_110_percent"] <= 1 and row["budget_ms"] > 0
         assert (row["error_max"] == 0) == (row["controller"] == "none") and row["cost_ms"] <= row["cost_p95_ms"]
