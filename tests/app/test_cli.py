@@ -227,7 +227,7 @@ def test_a_file_of_parts_is_said_to_be_joined(assemblies, capsys, monkeypatch):
         assert (joined in capsys.readouterr().err) == (parts > 1)
         assert ab.Model.load(name).parts == parts and ab.Model.load(name, orient=True).parts == parts
         if name.endswith(("glb", "obj", "stl")):
-            assert ab.scene_from_file(name, "cpu")[0].object_count == parts
+            assert ab.scene_from_file(name, "cpu").object_count == parts
 
 
 def test_a_scene_file_of_parts_warns(assemblies):

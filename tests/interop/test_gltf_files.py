@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers import refused
-from helpers.scenes import posed_triangles
+from helpers.scenes import names_of, posed_triangles
 
 import warp_abtree as ab
 
@@ -49,7 +49,8 @@ def read(tmp_path):
     def make(tree, blob, name="a.glb"):
         (tmp_path / name).write_bytes(glb(tree, blob) if name.endswith("glb") else json.dumps(tree).encode())
         model = ab.Model.load(tmp_path / name)
-        scene, names = ab.scene_from_file(tmp_path / name, device="cpu")
+        scene = ab.scene_from_file(tmp_path / name, device="cpu")
+        names = names_of(scene)
         found = {title: posed_triangles(scene, i) for i, title in enumerate(names)}
         vertices, faces, _ = model.mesh_at(model.lod_max)
         np.testing.assert_allclose(np.concatenate(list(found.values())), vertices[faces], atol=1e-6)
@@ -155,7 +156,7 @@ def test_what_is_not_read_as_it_stands_is_named(tmp_path, change, message):
     with pytest.warns(UserWarning, match=rf"a\.glb: {message}$"):
         assert ab.Model.load(tmp_path / "a.glb").face_count == faces
     with pytest.warns(UserWarning, match=rf"a\.glb: {message}$"):
-        assert ab.scene_from_file(tmp_path / "a.glb", device="cpu")[1] == ["crate"]
+        assert names_of(ab.scene_from_file(tmp_path / "a.glb", device="cpu")) == ["crate"]
 
 
 @pytest.mark.parametrize(
@@ -217,7 +218,8 @@ def test_objects_of_obj(tmp_path):
         for half, material in ((BOX.faces[:6], "blue"), (BOX.faces[6:], "red")):
             lines += [*(f"f {a - 8} {b - 8} {c - 8}" for a, b, c in half), f"usemtl {material}", f"g {material}"]
     (tmp_path / "a.obj").write_text("\n".join(lines))
-    scene, found = ab.scene_from_file(tmp_path / "a.obj", device="cpu")
+    scene = ab.scene_from_file(tmp_path / "a.obj", device="cpu")
+    found = names_of(scene)
     assert found == ["left", "right", "left_1"]
     model = ab.Model.load(tmp_path / "a.obj")
     vertices, faces, _ = model.mesh_at(model.lod_max)
@@ -230,5 +232,6 @@ def test_objects_of_obj(tmp_path):
         at = plain.index(f"o {names[k]}", 21 * k) + 9
         plain[at:at] = [f"f {a} {b} {c}" for a, b, c in (BOX.faces + 8 * k + 1).tolist()]
     (tmp_path / "b.obj").write_text("\n".join(plain))
-    scene, found = ab.scene_from_file(tmp_path / "b.obj", device="cpu")
+    scene = ab.scene_from_file(tmp_path / "b.obj", device="cpu")
+    found = names_of(scene)
     assert found == ["left", "right", "left_1"] and [model.face_count for model in scene.models] == [12] * 3
