@@ -21,7 +21,7 @@ from warp_abtree.app.cli import model_commands, report
 from warp_abtree.app.open_playback import open_playback
 from warp_abtree.model.mesh import describe_mesh, load_mesh
 
-COMMANDS = "info build query run sweep view picture bench".split()
+COMMANDS = "info build query clash run sweep view picture bench".split()
 VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
 ASIDE = (0.8, 0.1, -1e-3, 0.0, 0.6, 0.0, 0.8)
 
