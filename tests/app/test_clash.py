@@ -55,7 +55,7 @@ KNOWN = {
     "the same twice": ((CUBE,), (CUBE,), "interference", 0, (2, 5.001), True),
     "one inside": ((CUBE,), (trimesh.creation.icosphere(2, 1.0),), "interference", 0, (4, 5), False),
     "crossing trays": ((tray((10, 10, 10)),), (tray((3, 3, 20)),), "interference", 0, None, True),
-    "a sheet through a solid": ((CUBE,), (tray((90, 90, 2)), 0, 0, 0), "interference", 0, (3.5, 5), True),
+    "a sheet through a solid": ((CUBE,), (tray((90, 90, 2)), 20, -7, 0), "interference", 0, (3.5, 4.001), True),
     "in an open tray": ((tray((10, 10, 10)),), (trimesh.creation.box((1, 1, 1)),), "clearance", 4.5, (0, 0), False),
     "on an open tray": (
         (tray((10, 10, 10)),),
