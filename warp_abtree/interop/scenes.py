@@ -138,15 +138,29 @@ def scene_from_file(path, device=None, base_faces=10, progress=None, solid=False
         ValueError: As for `scene_from_trimesh`.
     """
     path, remarks = Path(path), Remarks()
-    name, kind, _ = split_file_name(path)
-    found = read_usd(path, remarks) if kind in USD and path.is_file() else read_file(path, remarks)
+    source = _read_objects(path, remarks)
     try:
-        source = found.as_scene(name) if isinstance(found, FileSurface) else found
         made = scene_from_trimesh(source, device, base_faces, progress, solid, orient)
     except MeshError as error:
         raise MeshError(f"{path}: {error}" + (f" ({remarks})" if str(remarks) else "")) from None
     remarks.warn(path)
     return made
+
+
+def _read_objects(path: Path, remarks):
+    """Return what a file holds as a trimesh.Scene."""
+    name, kind, _ = split_file_name(path)
+    found = read_usd(path, remarks) if kind in USD and path.is_file() else read_file(path, remarks)
+    return found.as_scene(name) if isinstance(found, FileSurface) else found
+
+
+def is_assembly(path) -> bool:
+    """Return whether a file is a scene of its own: of several objects, or USD, of which `Model.load` reads no mesh."""
+    try:
+        count = len(_read_objects(Path(path), Remarks()).graph.nodes_geometry)
+    except MeshError:
+        return False
+    return count > (0 if split_file_name(Path(path))[1] in USD else 1)
 
 
 def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 40), colour=(176, 176, 176)):
