@@ -85,9 +85,8 @@ def scene_from_trimesh(source, device=None, base_faces=10, progress=None, solid=
 
 def _mesh_hash(mesh) -> bytes:
     """Return a hash of the vertices and faces of a trimesh.Trimesh."""
-    found = hashlib.blake2b(np.ascontiguousarray(mesh.vertices, np.float64), digest_size=32)
-    found.update(np.ascontiguousarray(mesh.faces, np.int64))
-    return found.digest()
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    return hashlib.blake2b(vertices.tobytes() + faces.tobytes(), digest_size=32).digest()
 
 
 def _distinct(names) -> list[str]:

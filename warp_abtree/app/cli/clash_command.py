@@ -93,9 +93,10 @@ def find_clashes(scene: Scene, within: float = 0.0, tolerance: float | None = No
         decided = solid[pair].any()
         inside = deep > tolerance if decided else count > 0
         kind = CLASH_KINDS[0] if inside else CLASH_KINDS[1] if apart <= tolerance else CLASH_KINDS[2]
-        names = [scene.name(i) for i in pair]
-        is_open = tuple(name for name, i in zip(names, pair) if not solid[i])
-        clashes.append(Clash(*names, kind, max(apart, 0.0), deep if decided else None, count, is_open, tuple(pair)))
+        first, second = map(scene.name, pair)
+        is_open = tuple(name for name, i in zip((first, second), pair) if not solid[i])
+        depth_told = deep if decided else None
+        clashes.append(Clash(first, second, kind, max(apart, 0.0), depth_told, count, is_open, tuple(pair)))
     return sorted(clashes, key=_severity)
 
 
