@@ -73,9 +73,19 @@ def test_strips_and_fans(read, mode, indices):
     assert (area[:, 2] > 0).all() and area.sum(0).tolist() == [0, 0, 2.5]
 
 
-def test_materials_do_not_part_an_object(read):
-    parts = [{"attributes": {"POSITION": 0}, "indices": 1 + k, "material": k} for k in range(3)]
-    tree, blob = tree_of([POINTS, *np.split(CORNERS, 3)], parts, materials=[{}, {}, {}])
+@pytest.mark.parametrize("shared", [True, False], ids=["shared vertices", "own vertices"])
+def test_materials_do_not_part_an_object(read, shared, tmp_path):
+    """Nor open it: it can be a solid, and does not meet itself."""
+    parts = [{"attributes": {"POSITION": 0 if shared else 3 + k}, "indices": k, "material": k} for k in range(3)]
+    pieces = np.split(CORNERS, 3)
+    if shared:
+        arrays, parts = [POINTS, *pieces], [{**part, "indices": 1 + k} for k, part in enumerate(parts)]
+    else:
+        arrays = [np.arange(12, dtype=np.uint16)] * 3 + [POINTS[piece] for piece in pieces]
+    tree, blob = tree_of(arrays, parts, materials=[{}, {}, {}])
+    (tmp_path / "one.glb").write_bytes(glb(tree, blob))
+    alone = ab.scene_from_file(tmp_path / "one.glb", device="cpu", solid=True)
+    assert alone.object_solid == [True] and not len(alone.intersect().pairs)
     tree["nodes"] += [{"mesh": 0, "name": "crate", "matrix": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 0, 0, 1]}]
     tree["nodes"][0] |= {"children": [1], "translation": [0, 0, 1], "rotation": [0, 0, 1, 0], "scale": [2, 1, 1]}
     found = read(tree, blob)
