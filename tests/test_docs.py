@@ -166,7 +166,7 @@ def run_words(words):
         words = [*words, "--device", "cpu"]
     with contextlib.redirect_stdout(io.StringIO()) as shown:
         status = cli.main(words)
-    assert status == 0 and shown.getvalue(), words
+    assert status == (words[0] == "clash") and shown.getvalue(), words
     return None
 
 
@@ -179,7 +179,11 @@ def run_page(page, folder):
     for needs, kind, block in BLOCK.findall(page.read_text(encoding="utf-8")):
         if kind == "toml" and (name := re.match(r"# (\w+\.toml)\n", block)):
             (folder / name[1]).write_text(block)
-        elif kind == "python" and ".save(" in block and not missing(needs.split(", ") if needs else []):
+        elif (
+            kind == "python"
+            and re.search(r"\.(save|export)\(", block)
+            and not missing(needs.split(", ") if needs else [])
+        ):
             exec(block, space)
         elif kind == "sh":
             parts = [part.split("#")[0].split() for line in block.splitlines() for part in line.split("&&")]

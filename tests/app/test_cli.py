@@ -19,9 +19,10 @@ import warp_abtree.app as ab_app
 from warp_abtree.app.cli import main as cli
 from warp_abtree.app.cli import model_commands, report
 from warp_abtree.app.open_playback import open_playback
+from warp_abtree.app.playback import MeshPlayback
 from warp_abtree.model.mesh import describe_mesh, load_mesh
 
-COMMANDS = "info build query run sweep view picture bench".split()
+COMMANDS = "info build query clash run sweep view picture bench".split()
 VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
 ASIDE = (0.8, 0.1, -1e-3, 0.0, 0.6, 0.0, 0.8)
 
@@ -223,11 +224,29 @@ def test_a_file_of_parts_is_said_to_be_joined(assemblies, capsys, monkeypatch):
             assert (joined in shown.err) == (parts > 1) == ("scene_from_file" in shown.err), words
             assert words != "info {}" or json.loads(shown.out)["parts"] == parts
         title = Path(name).stem + (f" ({parts} parts joined)" if parts > 1 else "")
-        assert open_playback([name], "cpu").title == title
+        assert open_playback([name, "box.obj"], "cpu").title == f"{title} and box"
         assert (joined in capsys.readouterr().err) == (parts > 1)
         assert ab.Model.load(name).parts == parts and ab.Model.load(name, orient=True).parts == parts
         if name.endswith(("glb", "obj", "stl")):
-            assert ab.scene_from_file(name, "cpu")[0].object_count == parts
+            assert ab.scene_from_file(name, "cpu").object_count == parts
+
+
+def test_a_file_of_parts_is_a_scene(assemblies, capsys, device):
+    """Of `run`, `view` and `picture`, where it is given alone; one of a single object stays a mesh."""
+    for name, parts in assemblies.items():
+        playback = open_playback([name], device)
+        assert playback.title == Path(name).stem and playback.scene.object_count == parts
+        if parts == 1:
+            assert isinstance(playback, MeshPlayback)
+            continue
+        assert not capsys.readouterr().err
+        truth = ab.scene_from_file(name, device)
+        assert [playback.scene.name(i) for i in range(parts)] == [truth.name(i) for i in range(parts)]
+        np.testing.assert_array_equal(playback.step("faces").result.faces, truth.intersect(output="faces").faces)
+        found = json.loads(run(capsys, "run", name, "--frames", 2, "--json", "--device", device)[0])
+        assert found["objects"] == parts and found["models"] == len(truth.models) == len(found["meshes"])
+    assert "--lod: for meshes" in run(capsys, "picture", "two.glb", "--lod", 1, "--out", "a.png", status=2)[1][0]
+    assert "two.glb: objects: are those of the file" in run(capsys, "run", "two.glb", "--objects", 9, status=2)[1][0]
 
 
 def test_a_scene_file_of_parts_warns(assemblies):

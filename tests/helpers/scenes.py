@@ -111,3 +111,8 @@ def posed_triangles(scene, i):
     model, objects = scene.models[scene.object_model[i]], scene.batch().objects.pool
     vertices, faces, _ = model.mesh_at(model.lod_max)
     return (vertices @ objects.rotation.numpy()[i].T + objects.position.numpy()[i])[faces]
+
+
+def names_of(scene):
+    """Return the names of a scene's objects."""
+    return [scene.name(i) for i in range(scene.object_count)]

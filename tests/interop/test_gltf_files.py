@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers import refused
-from helpers.scenes import posed_triangles
+from helpers.scenes import names_of, posed_triangles
 
 import warp_abtree as ab
 
@@ -49,7 +49,8 @@ def read(tmp_path):
     def make(tree, blob, name="a.glb"):
         (tmp_path / name).write_bytes(glb(tree, blob) if name.endswith("glb") else json.dumps(tree).encode())
         model = ab.Model.load(tmp_path / name)
-        scene, names = ab.scene_from_file(tmp_path / name, device="cpu")
+        scene = ab.scene_from_file(tmp_path / name, device="cpu")
+        names = names_of(scene)
         found = {title: posed_triangles(scene, i) for i, title in enumerate(names)}
         vertices, faces, _ = model.mesh_at(model.lod_max)
         np.testing.assert_allclose(np.concatenate(list(found.values())), vertices[faces], atol=1e-6)
@@ -72,9 +73,19 @@ def test_strips_and_fans(read, mode, indices):
     assert (area[:, 2] > 0).all() and area.sum(0).tolist() == [0, 0, 2.5]
 
 
-def test_materials_do_not_part_an_object(read):
-    parts = [{"attributes": {"POSITION": 0}, "indices": 1 + k, "material": k} for k in range(3)]
-    tree, blob = tree_of([POINTS, *np.split(CORNERS, 3)], parts, materials=[{}, {}, {}])
+@pytest.mark.parametrize("shared", [True, False], ids=["shared vertices", "own vertices"])
+def test_materials_do_not_part_an_object(read, shared, tmp_path):
+    """Nor open it: it can be a solid, and does not meet itself."""
+    parts = [{"attributes": {"POSITION": 0 if shared else 3 + k}, "indices": k, "material": k} for k in range(3)]
+    pieces = np.split(CORNERS, 3)
+    if shared:
+        arrays, parts = [POINTS, *pieces], [{**part, "indices": 1 + k} for k, part in enumerate(parts)]
+    else:
+        arrays = [np.arange(12, dtype=np.uint16)] * 3 + [POINTS[piece] for piece in pieces]
+    tree, blob = tree_of(arrays, parts, materials=[{}, {}, {}])
+    (tmp_path / "one.glb").write_bytes(glb(tree, blob))
+    alone = ab.scene_from_file(tmp_path / "one.glb", device="cpu", solid=True)
+    assert alone.object_solid == [True] and not len(alone.intersect().pairs)
     tree["nodes"] += [{"mesh": 0, "name": "crate", "matrix": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 0, 0, 1]}]
     tree["nodes"][0] |= {"children": [1], "translation": [0, 0, 1], "rotation": [0, 0, 1, 0], "scale": [2, 1, 1]}
     found = read(tree, blob)
@@ -155,7 +166,7 @@ def test_what_is_not_read_as_it_stands_is_named(tmp_path, change, message):
     with pytest.warns(UserWarning, match=rf"a\.glb: {message}$"):
         assert ab.Model.load(tmp_path / "a.glb").face_count == faces
     with pytest.warns(UserWarning, match=rf"a\.glb: {message}$"):
-        assert ab.scene_from_file(tmp_path / "a.glb", device="cpu")[1] == ["crate"]
+        assert names_of(ab.scene_from_file(tmp_path / "a.glb", device="cpu")) == ["crate"]
 
 
 @pytest.mark.parametrize(
@@ -217,7 +228,8 @@ def test_objects_of_obj(tmp_path):
         for half, material in ((BOX.faces[:6], "blue"), (BOX.faces[6:], "red")):
             lines += [*(f"f {a - 8} {b - 8} {c - 8}" for a, b, c in half), f"usemtl {material}", f"g {material}"]
     (tmp_path / "a.obj").write_text("\n".join(lines))
-    scene, found = ab.scene_from_file(tmp_path / "a.obj", device="cpu")
+    scene = ab.scene_from_file(tmp_path / "a.obj", device="cpu")
+    found = names_of(scene)
     assert found == ["left", "right", "left_1"]
     model = ab.Model.load(tmp_path / "a.obj")
     vertices, faces, _ = model.mesh_at(model.lod_max)
@@ -230,5 +242,6 @@ def test_objects_of_obj(tmp_path):
         at = plain.index(f"o {names[k]}", 21 * k) + 9
         plain[at:at] = [f"f {a} {b} {c}" for a, b, c in (BOX.faces + 8 * k + 1).tolist()]
     (tmp_path / "b.obj").write_text("\n".join(plain))
-    scene, found = ab.scene_from_file(tmp_path / "b.obj", device="cpu")
+    scene = ab.scene_from_file(tmp_path / "b.obj", device="cpu")
+    found = names_of(scene)
     assert found == ["left", "right", "left_1"] and [model.face_count for model in scene.models] == [12] * 3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers import refused
-from helpers.scenes import posed_triangles, scene_with
+from helpers.scenes import names_of, posed_triangles, scene_with
 
 import warp_abtree as ab
 
@@ -51,7 +51,8 @@ def assert_matches(scene, names, meshes, tolerance=1e-12):
 
 def test_trimesh_scene_in():
     source = assembly(with_extras=True)
-    scene, names = ab.scene_from_trimesh(source, device="cpu")
+    scene = ab.scene_from_trimesh(source, device="cpu")
+    names = names_of(scene)
     meshes = {name: mesh for name, mesh in nodes_in_the_world(source).items() if isinstance(mesh, trimesh.Trimesh)}
     assert_matches(scene, names, meshes)
     # Rigid, doubled, mirrored, flattened: four of each geometry.
@@ -135,7 +136,8 @@ def test_usd_in(tmp_path, suffix):
     pytest.importorskip("pxr")
     path = tmp_path / f"scene.{suffix}"
     write_usd(path)
-    scene, names = ab.scene_from_file(path, device="cpu")
+    scene = ab.scene_from_file(path, device="cpu")
+    names = names_of(scene)
     assert sorted(names) == sorted([*USD_PRIMS, "/root/quad"]) and len(scene.models) == 2
     for i, name in enumerate(names):
         if name == "/root/quad":
@@ -190,7 +192,8 @@ def test_usd_shapes_are_read_as_meshes(tmp_path, kind):
             shape.GetPrim().GetAttribute(name).Set(value)
         UsdGeom.Xformable(shape).AddTranslateOp().Set(Gf.Vec3d(5, 6, 7))
     stage.GetRootLayer().Save()
-    scene, names = ab.scene_from_file(tmp_path / "shapes.usda", device="cpu")
+    scene = ab.scene_from_file(tmp_path / "shapes.usda", device="cpu")
+    names = names_of(scene)
     assert sorted(names) == sorted(f"/{axis}" for axis in axes)
     for i, name in enumerate(names):
         points = (posed_triangles(scene, i) - [5, 6, 7])[..., AXES[name[1]]]
@@ -212,7 +215,8 @@ def test_usd_planes(tmp_path):
         plane = UsdGeom.Plane.Define(stage, f"/{axis}")
         plane.GetAxisAttr().Set(axis), plane.GetWidthAttr().Set(2.0), plane.GetLengthAttr().Set(3.0)
     stage.GetRootLayer().Save()
-    scene, names = ab.scene_from_file(tmp_path / "planes.usda", device="cpu")
+    scene = ab.scene_from_file(tmp_path / "planes.usda", device="cpu")
+    names = names_of(scene)
     for i, name in enumerate(names):
         found = posed_triangles(scene, i)
         assert np.ptp(found.reshape(-1, 3), axis=0).tolist() == list(sizes[name[1]]) and len(found) == 2
@@ -241,7 +245,8 @@ def test_what_usd_hides_is_left_out_and_named(tmp_path):
     UsdGeom.Camera.Define(stage, "/root/eye")
     stage.GetRootLayer().Save()
     with pytest.warns(UserWarning) as caught:
-        scene, names = ab.scene_from_file(path, device="cpu")
+        scene = ab.scene_from_file(path, device="cpu")
+        names = names_of(scene)
     (said,) = [str(warning.message) for warning in caught]
     assert said.startswith(f"{path}: left out ") and caught[0].filename == __file__
     for part in ("/root/turned (invisible)", "/copy1 (invisible)", "/root/dust (Points)"):
@@ -289,7 +294,8 @@ def test_usd_purposes_and_what_is_not_carried_out(tmp_path):
     stage.GetPrimAtPath("/gone").SetSpecifier(Sdf.SpecifierDef)
     stage.GetRootLayer().Save()
     with pytest.warns(UserWarning) as caught:
-        scene, names = ab.scene_from_file(path, device="cpu")
+        scene = ab.scene_from_file(path, device="cpu")
+        names = names_of(scene)
     shown = ["/plain", "/default", "/render", "/helpers/kept", "/smooth", "/holed", "/skinned"]
     assert sorted(names) == sorted(shown)
     counts = {name: scene.models[scene.object_model[i]].face_count for i, name in enumerate(names)}
@@ -309,7 +315,7 @@ def test_usd_polygons_do_not_fold(tmp_path, turned):
     stage = Usd.Stage.CreateNew(str(tmp_path / "letter.usda"))
     define_mesh(stage, "/letter", np.insert(letter, 2, 0, 1), [range(8)])
     stage.GetRootLayer().Save()
-    scene, _ = ab.scene_from_file(tmp_path / "letter.usda", device="cpu")
+    scene = ab.scene_from_file(tmp_path / "letter.usda", device="cpu")
     assert trimesh.triangles.area(posed_triangles(scene, 0)).sum() == pytest.approx(10)
 
 
@@ -330,13 +336,13 @@ def test_coloured_result_out(device, tmp_path):
     ab.to_trimesh(scene, result).export(tmp_path / "hits.glb")
     meshes = nodes_in_the_world(trimesh.load_scene(tmp_path / "hits.glb", process=False))
     whole = nodes_in_the_world(ab.to_trimesh(scene, scene.intersect(output="any"), names="abcdef"))
-    assert sorted(meshes) == [f"object {i}" for i in range(6)]
+    assert sorted(meshes) == [f"trimesh {i}" for i in range(6)]
     for i, name in enumerate("abcdef"):
         vertices, faces, ids = ring.mesh_at(scene.lods[i])
         rows = [result.faces[result.pairs[result.faces[:, 0], k] == i][:, 1 + k] for k in (0, 1)]
         hit = np.isin(ids, np.concatenate(rows))
         corners = vertices[faces[hit]] + [0.5 * i + (i > 2) * 9, 0, 0]
-        mesh = meshes[f"object {i}"]
+        mesh = meshes[f"trimesh {i}"]
         assert len(mesh.faces) == len(faces) and hit.any() == (i in intersecting)
         assert np.allclose(red_faces(mesh), corners, atol=1e-5)
         assert len(red_faces(whole[name])) == (len(whole[name].faces) if i in intersecting else 0)
@@ -344,15 +350,18 @@ def test_coloured_result_out(device, tmp_path):
 
 def test_plain_scene_out_and_in(tmp_path):
     source = assembly()
-    scene, names = ab.scene_from_trimesh(source, device="cpu")
-    out = ab.to_trimesh(scene, names=names)
+    scene = ab.scene_from_trimesh(source, device="cpu")
+    names = names_of(scene)
+    out = ab.to_trimesh(scene)
     assert len(out.geometry) == 8, "instances share a geometry"
-    again, back = ab.scene_from_trimesh(out, device="cpu")
+    again = ab.scene_from_trimesh(out, device="cpu")
+    back = names_of(again)
     assert back == names and len(again.models) == 8
     assert_matches(again, back, nodes_in_the_world(source))
     # glTF holds float32, and keeps instances.
     source.export(tmp_path / "scene.glb")
-    again, back = ab.scene_from_file(tmp_path / "scene.glb", device="cpu")
+    again = ab.scene_from_file(tmp_path / "scene.glb", device="cpu")
+    back = names_of(again)
     assert len(again.models) == 8
     assert_matches(again, back, nodes_in_the_world(source), 1e-5)
     for bad in (names[:-1], [names[0]] * 12, list(range(12))):
@@ -363,4 +372,4 @@ def test_plain_scene_out_and_in(tmp_path):
 
 def test_one_world_out():
     scene = scene_with("cpu", *[(ab.Model.load(BOX), np.eye(4), {"world": world}) for world in (-1, 0, 1, 1)])
-    assert sorted(ab.to_trimesh(scene, world=1).graph.nodes_geometry) == ["object 0", "object 2", "object 3"]
+    assert sorted(ab.to_trimesh(scene, world=1).graph.nodes_geometry) == ["trimesh 0", "trimesh 2", "trimesh 3"]

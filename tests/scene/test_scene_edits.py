@@ -113,7 +113,7 @@ def test_what_is_removed_is_nowhere(device):
     refused(ValueError, "twice", scene.remove, [0, 0])
     refused(ValueError, "outside 0 .. 2", scene.remove, [0, 3])
     assert everything(scene) == before
-    assert list(ab.to_trimesh(scene).graph.nodes_geometry) == ["object 0", "object 2"]
+    assert list(ab.to_trimesh(scene).graph.nodes_geometry) == ["small ball 0", "small ball 2"]
     # The filter of objects 0 and 1 went with object 1.
     assert scene.add(sample("box"), (0.5, 0.25, 0, 0, 0, 0, 1)) == 1
     assert [0, 1] in scene.broad_phase().tolist()

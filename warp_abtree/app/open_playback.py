@@ -8,7 +8,8 @@ from warp_abtree.app.cli.arguments import Parser, positive_count
 from warp_abtree.app.cli.model_commands import load_model, lod_at
 from warp_abtree.app.playback import MeshPlayback, Playback, ScenePlayback
 from warp_abtree.app.toml.folder import find_scene
-from warp_abtree.app.toml.scene_file import load_scene
+from warp_abtree.app.toml.scene_file import load_assembly, load_scene
+from warp_abtree.interop.scenes import is_assembly
 from warp_abtree.model.model import Model
 from warp_abtree.scene.scene import Scene
 
@@ -16,7 +17,7 @@ OVERLAP = 0.25  # of the smaller extent: by so much a mesh without a pose reache
 
 
 def open_playback(paths, device=None, progress=None, objects=None, poses=(), lod=None) -> Playback:
-    """Open one scene file (.toml), or meshes and built models (.npz).
+    """Open one scene file (.toml), one file of several objects, or meshes and built models (.npz).
 
     Args:
         device, progress, objects: As for `load_scene`; objects for scene files alone.
@@ -24,17 +25,19 @@ def open_playback(paths, device=None, progress=None, objects=None, poses=(), lod
         lod: LOD of every mesh as for `resolve_lod`; None is the finest.
     """
     paths = [str(find_scene(path)) for path in paths]
-    suffixes = [Path(path).suffix.lower() for path in paths]
-    if ".toml" in suffixes:
-        if len(paths) > 1:
-            raise ValueError(f"{paths[suffixes.index('.toml')]}: a scene file is looked at alone")
-        for name, value in (("--pose", len(poses)), ("--lod", lod is not None)):
-            if value:
-                raise ValueError(f"{name}: for meshes; {paths[0]} says where its objects are and at which LODs")
-        return ScenePlayback(load_scene(paths[0], device=device, progress=progress, objects=objects))
-    if objects is not None:
+    scenes = [path for path in paths if Path(path).suffix.lower() == ".toml"]
+    if scenes and len(paths) > 1:
+        raise ValueError(f"{scenes[0]}: a scene file is looked at alone")
+    if objects is not None and not scenes:
         raise ValueError("--objects: for scene files")
-    return _open_meshes(paths, device, progress, poses, lod)
+    if not scenes and (len(paths) > 1 or not is_assembly(paths[0])):
+        return _open_meshes(paths, device, progress, poses, lod)
+    for name, value in (("--pose", len(poses)), ("--lod", lod is not None)):
+        if value:
+            raise ValueError(f"{name}: for meshes; {paths[0]} says where its objects are and at which LODs")
+    if scenes:
+        return ScenePlayback(load_scene(paths[0], device=device, progress=progress, objects=objects))
+    return ScenePlayback(load_assembly(Path(paths[0]), device, progress))
 
 
 def _open_meshes(paths, device, progress, poses, lod) -> MeshPlayback:
@@ -58,7 +61,7 @@ def _open_meshes(paths, device, progress, poses, lod) -> MeshPlayback:
 
 def add_playback_arguments(sub: Parser):
     """Add the arguments that name what is shown."""
-    about = "one scene file (.toml), or meshes and built models (.npz)"
+    about = "one scene file (.toml) or file of several objects, or meshes and built models (.npz)"
     sub.add_file("source", nargs="+", metavar="SCENE_OR_MESHES", help=about)
     about = "pose of the second mesh, again for the third; without it each stands beside the one before, a bit inside"
     sub.add_pose(about, action="append", default=[])

@@ -1,9 +1,11 @@
 """Scenes from and to trimesh, glTF and USD."""
 
+import hashlib
 from pathlib import Path
 
 import numpy as np
 
+from warp_abtree.checks.arguments import flag
 from warp_abtree.interop.usd import read_usd
 from warp_abtree.model.files.found import FileSurface, Remarks
 from warp_abtree.model.files.read import USD, read_file, split_file_name
@@ -16,54 +18,85 @@ from warp_abtree.state.poses import RIGID_TOLERANCE
 STRETCH_TOLERANCE = 1e-9
 
 
-def scene_from_trimesh(source, device=None, base_faces=10, progress=None):
-    """Make a scene of a trimesh.Scene: every node that holds a mesh becomes an object.
+class FileScene(Scene):
+    """The scene of a file, which also unpacks as `scene, names`.
 
-    Nodes of one geometry share a model. Of a transform that is not rigid, the stretch goes into the model, which nodes
-    of equal stretch share. Points and paths are ignored.
+    That pair is what reading returned before objects had names; programs of then keep running. `scene.name(i)` is how
+    to ask for a name.
+    """
+
+    def __getitem__(self, k):
+        return (self, [self.name(i) for i in np.flatnonzero(self.present)])[k]
+
+
+def scene_from_trimesh(source, device=None, base_faces=10, progress=None, solid=False, orient=False) -> FileScene:
+    """Make a scene of a trimesh.Scene: every node that holds a mesh becomes an object of the node's name.
+
+    Nodes of equal meshes share a model, whether of one geometry or of several. Of a transform that is not rigid, the
+    stretch goes into the model, which nodes of equal stretch share. Points and paths are ignored.
 
     Args:
         source: trimesh.Scene.
         device: As for `Scene`.
-        base_faces, progress: As for `Model.load`.
-
-    Returns:
-        The `Scene`, and the node's name of each object, a list.
+        base_faces, progress, orient: As for `Model.load`.
+        solid: Whether each object is a solid, as for `Scene.add`; "closed" makes solids of those whose mesh is closed.
 
     Raises:
         TypeError: source is no trimesh.Scene.
-        MeshError: A mesh cannot be used, a node's transform is singular or not affine, or there is no mesh.
+        ValueError: solid is neither a bool nor "closed".
+        MeshError: A mesh cannot be used, a node's transform is singular or not affine, or there is no mesh; or the mesh
+            of a node that is to be a solid is not closed. The message names the node.
     """
     import trimesh
 
     if not isinstance(source, trimesh.Scene):
         raise TypeError(f"source is a {type(source).__name__}, not a trimesh.Scene")
+    every = solid != "closed" and flag(solid, "solid")
+    keys = {name: _mesh_hash(mesh) for name, mesh in source.geometry.items() if isinstance(mesh, trimesh.Trimesh)}
     placed = []
     for node in source.graph.nodes_geometry:
         transform, geometry = source.graph[node]
-        mesh = source.geometry[geometry]
-        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            placed.append((str(node), geometry, mesh, *_split_transform(np.asarray(transform, np.float64), node)))
+        if geometry in keys and len(source.geometry[geometry].faces):
+            placed.append((node, geometry, *_split_transform(np.asarray(transform, np.float64), node)))
     if not placed:
         raise MeshError("the trimesh.Scene holds no node with a mesh")
-    scene, names = Scene(device), []
-    models: dict[str, list] = {}
-    for node, geometry, mesh, pose, stretch in placed:
-        known = models.setdefault(geometry, [])
+    scene, models = FileScene(device), dict[bytes, list]()
+    names = _distinct(str(node) or "object" for node, *_ in placed)
+    for name, (node, geometry, pose, stretch) in zip(names, placed):
+        known = models.setdefault(keys[geometry], [])
         alike = (pair for pair in known if np.abs(pair[0] - stretch).max() <= STRETCH_TOLERANCE * np.abs(pair[0]).max())
         own, model = next(alike, (stretch, None))
-        if model is None:
-            stretched, matrix = trimesh.Scene(), np.eye(4)
-            matrix[:3, :3] = stretch
-            stretched.add_geometry(mesh, transform=matrix)
-            model = Model.load(load_mesh(stretched, name=str(geometry)), base_faces, progress)
-            known.append((stretch, model))
-        if own is not stretch and not (own == np.eye(3)).all():
-            # The pose takes up the small difference of the two stretches.
-            pose[:3, :3] = pose[:3, :3] @ stretch @ np.linalg.inv(own)
-        scene.add(model, pose)
-        names.append(node)
-    return scene, names
+        try:
+            if model is None:
+                stretched, matrix = trimesh.Scene(), np.eye(4)
+                matrix[:3, :3] = stretch
+                stretched.add_geometry(source.geometry[geometry], transform=matrix)
+                mesh = load_mesh(stretched, name=str(geometry))
+                model = Model.load(mesh, base_faces, progress, orient=orient)
+                known.append((stretch, model))
+            if own is not stretch and not (own == np.eye(3)).all():
+                # The pose takes up the small difference of the two stretches.
+                pose[:3, :3] = pose[:3, :3] @ stretch @ np.linalg.inv(own)
+            scene.add(model, pose, solid=every or (solid == "closed" and model.winding.is_closed), name=name)
+        except MeshError as error:
+            raise MeshError(f"node {node!r}: {error}") from None
+    return scene
+
+
+def _mesh_hash(mesh) -> bytes:
+    """Return a hash of the vertices and faces of a trimesh.Trimesh."""
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    return hashlib.blake2b(vertices.tobytes() + faces.tobytes(), digest_size=32).digest()
+
+
+def _distinct(names) -> list[str]:
+    """Return names with a suffix to those that repeat."""
+    from trimesh.util import unique_name
+
+    seen, counts = dict[str, None](), {}
+    for name in names:
+        seen[unique_name(name, seen, counts)] = None
+    return list(seen)
 
 
 def _split_transform(transform, node):
@@ -82,35 +115,51 @@ def _split_transform(transform, node):
     return pose, sign * right.T @ np.diag(sizes) @ right
 
 
-def scene_from_file(path, device=None, base_faces=10, progress=None):
+def scene_from_file(path, device=None, base_faces=10, progress=None, solid=False, orient=False) -> FileScene:
     """Make a scene of a file: every node that holds a mesh becomes an object, equal meshes share a model.
 
     Args:
-        path: GLB, glTF or another format that `Model.load` reads; USD (extra `usd`), at the stage's first time. All in
-            the file's units and axes. Of OBJ each `o` line begins an object, `g` and `usemtl` do not; of STL, each
-            solid is one. Objects of USD are its visible meshes and basic shapes of default or render purpose, including
+        path: GLB, glTF, 3MF, STEP (extra `cad`, in millimetres) or another format that `Model.load` reads; USD (extra
+            `usd`), at the stage's first time. All in the file's units and axes. A node is one object whatever its
+            number of materials. Of OBJ each `o` line begins an object, `g` and `usemtl` do not; of STL, each solid is
+            one. Objects of USD are its visible meshes and basic shapes of default or render purpose, including
             instances and those of point instancers. Cubes and planes are exact; spheres (5,120 faces), cylinders, cones
             and capsules (64 sections) lie within 0.002 of their radius inside. A warning names what is left out, such
             as invisible prims, guides, proxies, points and lines, and what is taken at rest or not subdivided.
-        device, base_faces, progress: As for `scene_from_trimesh`.
+        device, base_faces, progress, solid, orient: As for `scene_from_trimesh`.
 
     Returns:
-        The `Scene`, and the name of each object, a list: the node's, the `o` line's, or the file's; in USD the
-        prim's path.
+        The scene, whose objects are named by the node, the `o` line, or the file; in USD by the prim's path. A name
+        that repeats gets a suffix.
 
     Raises:
         MeshError: The file is missing or cannot be read, or as for `load_mesh` and `scene_from_trimesh`.
+        ValueError: As for `scene_from_trimesh`.
     """
     path, remarks = Path(path), Remarks()
-    name, kind, _ = split_file_name(path)
-    found = read_usd(path, remarks) if kind in USD and path.is_file() else read_file(path, remarks)
+    source = _read_objects(path, remarks)
     try:
-        source = found.as_scene(name) if isinstance(found, FileSurface) else found
-        made = scene_from_trimesh(source, device, base_faces, progress)
+        made = scene_from_trimesh(source, device, base_faces, progress, solid, orient)
     except MeshError as error:
         raise MeshError(f"{path}: {error}" + (f" ({remarks})" if str(remarks) else "")) from None
     remarks.warn(path)
     return made
+
+
+def _read_objects(path: Path, remarks):
+    """Return what a file holds as a trimesh.Scene."""
+    name, kind, _ = split_file_name(path)
+    found = read_usd(path, remarks) if kind in USD and path.is_file() else read_file(path, remarks)
+    return found.as_scene(name) if isinstance(found, FileSurface) else found
+
+
+def is_assembly(path) -> bool:
+    """Return whether a file is a scene of its own: of several objects, or USD, of which `Model.load` reads no mesh."""
+    try:
+        count = len(_read_objects(Path(path), Remarks()).graph.nodes_geometry)
+    except MeshError:
+        return False
+    return count > (0 if split_file_name(Path(path))[1] in USD else 1)
 
 
 def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 40), colour=(176, 176, 176)):
@@ -121,7 +170,7 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
     Args:
         scene: `Scene`.
         result: `Result` of the scene at its poses: intersecting faces are coloured, or whole objects if it has none.
-        names: Node name of each object, n different strings; by default "object 0" and so on.
+        names: Node name of each object, n different strings; by default those of the scene, a suffix to what repeats.
         world: Include only objects of this world and those in every world.
         hit_colour, colour: Red, green, blue, 0 to 255, of intersecting faces or objects and of the rest.
 
@@ -131,7 +180,9 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
     import trimesh
 
     count = scene.object_count
-    names = [f"object {i}" for i in range(count)] if names is None else list(names)
+    if names is None:
+        names = _distinct(scene.name(i) if there else "removed" for i, there in enumerate(scene.present))
+    names = list(names)
     if len(names) != count or len(set(names)) != count or not all(isinstance(name, str) for name in names):
         raise ValueError(f"names: not {count} different strings")
     if result is not None and len(result.pairs) and int(result.pairs.max()) >= count:

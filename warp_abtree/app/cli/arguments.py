@@ -7,7 +7,7 @@ PROGRAM = "warp-abtree"
 EXIT_STATUS = """\
 exit status:
   0    done
-  1    work was lost, a device failed, or the reader of the output went away
+  1    work was lost, a device failed, the reader of the output went away, or `clash` found interference
   2    bad input; one line on stderr says what and where
   130  interrupted (SIGINT)
   143  terminated (SIGTERM)

@@ -1,7 +1,7 @@
-"""The command line: ``warp-abtree info|build|query|run|sweep|view|picture|bench``.
+"""The command line: ``warp-abtree info|build|query|clash|run|sweep|view|picture|bench``.
 
-Exit status 0 when done, 2 with one line on stderr for bad input, 1 where work was lost or a device failed, 130 and 143
-when stopped by SIGINT and SIGTERM.
+Exit status 0 when done, 2 with one line on stderr for bad input, 1 where work was lost, a device failed, or `clash`
+found interference, 130 and 143 when stopped by SIGINT and SIGTERM.
 """
 
 import argparse
@@ -13,7 +13,14 @@ from pathlib import Path
 
 import warp as wp
 
-from warp_abtree.app.cli import bench_command, model_commands, query_command, run_command, sweep_command
+from warp_abtree.app.cli import (
+    bench_command,
+    clash_command,
+    model_commands,
+    query_command,
+    run_command,
+    sweep_command,
+)
 from warp_abtree.app.cli.arguments import EXIT_STATUS, PROGRAM, Parser, PrintCompletion, shield_numbers
 from warp_abtree.app.cli.progress import Progress, compile_notice, start_warp
 from warp_abtree.app.pictures import command as picture_command
@@ -56,6 +63,7 @@ def make_parser() -> argparse.ArgumentParser:
     command("build", models.build, models.BUILD_SUMMARY, models.BUILD_EXAMPLES, models.add_build_arguments)
     for name, module, function in (
         ("query", query_command, query_command.query),
+        ("clash", clash_command, clash_command.clash),
         ("run", run_command, run_command.run),
         ("view", view_command, view_command.run_viewer),
         ("picture", picture_command, picture_command.picture),

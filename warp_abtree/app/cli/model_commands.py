@@ -18,7 +18,7 @@ INFO_SUMMARY = "say what a mesh or a built model holds and what is odd about it"
 INFO_EXAMPLES = ("warp:bunny --json", "bunny.npz")
 BUILD_SUMMARY = "build models from meshes and save them"
 BUILD_EXAMPLES = ("warp:bunny bunny.npz --base-faces 100", "warp:bear warp:rocks .")
-KEPT_APART = "scene_from_file in Python, or a scene file with a model of each, keeps them apart"
+KEPT_APART = "clash, run, view and picture of this file alone, and scene_from_file in Python, keep them apart"
 LISTED_FRACTIONS = (0.5, 0.2, 0.1, 0.05, 0.01)  # of the faces, at which `build` prints the errors
 
 

@@ -29,7 +29,7 @@ PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg", ".webp", ".gif")
 
 def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
-    about = f"scene file (.toml), or one of {', '.join(scene_names())}"
+    about = f"scene file (.toml), file of several objects, or one of {', '.join(scene_names())}"
     sub.add_file("scene", metavar="SCENE", help=about)
     sub.add_argument("--frames", type=positive_count, metavar="N", help="frames to run (the scene's own number)")
     sub.add_file("--picture", type=Path, metavar="PNG", help="draw the scene, intersecting faces coloured")

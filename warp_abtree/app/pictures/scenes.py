@@ -6,7 +6,8 @@ import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.pictures.render import Panel, camera_of, crop, draw, lay_out, render, write_animation
-from warp_abtree.app.render_data import RenderData, Settings, Snapshot, compose, objects_of_world
+from warp_abtree.app.playback import MeshView
+from warp_abtree.app.render_data import LABELS, RenderData, Settings, Snapshot, compose, objects_of_world
 from warp_abtree.app.styles import COLOURS, NEAREST_COLOUR
 from warp_abtree.scene.scene import Scene
 
@@ -64,6 +65,17 @@ def draw_frames(scene: Scene, snapshots, shown, path, title: str, view, settings
     images = crop([render(panel, camera, size) for panel in panels])
     drawn = [lay_out([image], [panel.title], title, legend) for image, panel in zip(images, panels)]
     write_animation(drawn, path, round(1000 * (times[-1] - times[0]) / (len(times) - 1)))
+
+
+def draw_clashes(scene: Scene, result, path, title: str):
+    """Draw a scene to a PNG file, with the faces, curves and names of a result's pairs that have contacts."""
+    view, cache = MeshView(), geometry.MeshCache(scene)
+    snapshot = Snapshot(0, 0.0, scene.poses, scene.lods, result, None)
+    panel = make_panel(cache, compose(cache, snapshot, np.arange(scene.object_count), Settings()))
+    panel.lines.append((np.stack([result.contacts["p0"], result.contacts["p1"]], 1), NEAREST_COLOUR))
+    met = np.flatnonzero(result.count)[:LABELS]
+    panel.labels += [(result.pair_contacts["point"][k], ", ".join(map(scene.name, result.pairs[k]))) for k in met]
+    draw([panel], path, title, [], view.eye, view.up, SIZE)
 
 
 def panel_lods(loaded) -> list[np.ndarray]:

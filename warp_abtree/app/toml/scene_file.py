@@ -17,6 +17,7 @@ from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.models import build_model, check_faces
 from warp_abtree.app.toml.objects import make_groups
 from warp_abtree.checks.arguments import whole_number
+from warp_abtree.interop.scenes import is_assembly, scene_from_file
 from warp_abtree.model.files.found import MeshError
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame
@@ -111,7 +112,8 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
     """Read a scene file, build its models and place its objects.
 
     Args:
-        path: TOML file, or the name of a scene that comes with the package, such as "bunny_tori".
+        path: TOML file, or the name of a scene that comes with the package, such as "bunny_tori"; or a file of several
+            objects that `scene_from_file` reads, which stand still.
         device: Warp device; None for Warp's default.
         progress: Called as progress(stage, done, total) during long builds.
         objects: About so many objects in all: every `worlds`, or else `count`, of the file is multiplied by the same
@@ -126,6 +128,10 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
         raise ValueError(f"objects {objects!r} is not a whole number")
     objects = None if objects is None else whole_number(objects, "objects", 1, 2**31 - 1)
     path, scene = find_scene(path), Scene(device=device)
+    if text is None and path.suffix.lower() not in ("", ".toml") and is_assembly(path):
+        if objects is not None:
+            fail(path, "objects", "are those of the file; their number is for scene files in TOML")
+        return load_assembly(path, device, progress)
     tables = read_tables(path, text)
     if not tables.objects:
         fail(path, "the file", "no [[objects]]")
@@ -162,6 +168,30 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
     scene.set_lods(loaded.lods_at(0.0))
     scene.set_poses(motion.poses(0.0))
     return loaded
+
+
+def load_assembly(path: Path, device=None, progress=None) -> SceneFile:
+    """Read a file of several objects, which stand still at their finest, as `load_scene`."""
+    tables = read_tables(path, "models = {}")  # all that a file may leave out
+    scene = scene_from_file(path, device, progress=progress)
+    poses = scene.poses
+    return SceneFile(
+        path=path,
+        title=path.stem,
+        frames=tables.scene.frames,
+        time_step=tables.scene.time_step,
+        models={scene.name(scene.object_model.index(k)): model for k, model in enumerate(scene.models)},
+        scene=scene,
+        motion=Kinematic(poses[:, :3], poses[:, 3:]),
+        worlds=scene.worlds,
+        base_lods=scene.lods.astype(np.int64),
+        sweeps=[],
+        picture=tables.picture,
+        camera=None,
+        control=make_control(path, None),
+        dynamics=None,
+        kinematic=np.zeros(scene.object_count, bool),
+    )
 
 
 def as_list(value) -> list:

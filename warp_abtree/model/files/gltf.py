@@ -93,7 +93,7 @@ class _Reader:
                 raise MeshError(f"{self.where}: node {k} hangs on two nodes or on itself")
             seen.add(k)
             node = nodes[k]
-            name = trimesh.util.unique_name(str(node.get("name", k)), names, counts)
+            name = trimesh.util.unique_name(str(node.get("name") or k), names, counts)
             names.add(name)
             extensions = node.get("extensions", {})
             if not extensions.get(VISIBILITY, {}).get("visible", True):
@@ -122,7 +122,7 @@ class _Reader:
         if index in self._meshes:
             return self._meshes[index]
         mesh = self.tree["meshes"][index]
-        name = trimesh.util.unique_name(str(mesh.get("name", f"mesh {index}")), scene.geometry)
+        name = trimesh.util.unique_name(str(mesh.get("name") or f"mesh {index}"), scene.geometry)
         vertices, faces, starts, count = [], [], {}, 0
         for primitive in mesh["primitives"]:
             kind = KINDS.get(primitive.get("mode", 4))

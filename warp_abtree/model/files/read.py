@@ -1,11 +1,16 @@
 """Mesh files of all formats: our own readers where polygons, parts or what is left out matter, trimesh for the rest."""
 
 import codecs
+import contextlib
 import io
+import os
 import re
+import sys
 import warnings
 import zlib
 from pathlib import Path
+
+import numpy as np
 
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.model.files.collada import read_collada
@@ -19,9 +24,11 @@ from warp_abtree.model.files.unpack import gunzip, unzip
 
 SURFACES = {"obj": read_obj, "ply": read_ply, "off": read_off, "stl": read_stl, "stl_ascii": read_stl}
 USD = ("usd", "usda", "usdc", "usdz")
+STEP = ("step", "stp")
 # Of trimesh, or of ours: packages that some formats need.
-NEEDED = {"step": "cascadio", "stp": "cascadio", "dae": "pycollada", "zae": "pycollada", "xaml": "lxml"}
+NEEDED = {"dae": "pycollada", "zae": "pycollada", "xaml": "lxml"}
 NEEDED |= {"3mf": "lxml networkx", "3dxml": "lxml networkx"}
+MILLIMETRES = 1000.0  # in a metre, the unit of glTF
 UNREAD = {"tar.gz", "tar.bz2", "bz2"}  # archives that trimesh would read past the limit, and past our readers
 
 
@@ -71,6 +78,8 @@ def _read_data(data, kind, where, resolver, remarks):
         return read_gltf(data, where, resolver, remarks)
     if kind == "dae":
         return read_collada(data, where, remarks)
+    if kind in STEP:
+        return _read_step(data, where, remarks)
     if kind in UNREAD:
         raise MeshError(f"{where}: unpack it; of archives zip and gz alone are read")
     known = trimesh.available_formats() - UNREAD
@@ -91,6 +100,41 @@ def _read_data(data, kind, where, resolver, remarks):
         raise
     except Exception as error:  # trimesh's readers raise whatever goes wrong inside them
         raise MeshError(f"{where}: cannot be read as {kind}: {first_line(error)}") from None
+
+
+def _read_step(data, where, remarks):
+    """Return the parts of a STEP file in millimetres, whatever its units, as a trimesh.Scene."""
+    try:
+        import cascadio
+    except ImportError:
+        raise MeshError(f"{where}: reading STEP needs cascadio: pip install cascadio") from None
+    with _stdout_to_stderr():
+        converted = cascadio.load(data, "step")
+    if not converted:
+        raise MeshError(f"{where}: cannot be read as STEP")
+    scene = read_gltf(converted, where, None, remarks)
+    if not scene.geometry:
+        raise MeshError(f"{where}: holds no solid or surface")
+    for mesh in scene.geometry.values():
+        # Rounded as they were in metres, most coordinates are those of the file again.
+        mesh.vertices = (mesh.vertices * MILLIMETRES).astype(np.float32)
+    for node in scene.graph.nodes_geometry:
+        pose, geometry = scene.graph[node]
+        scene.graph.update(node, geometry=geometry, matrix=np.vstack([pose[:3] * [1, 1, 1, MILLIMETRES], pose[3]]))
+    return scene
+
+
+@contextlib.contextmanager
+def _stdout_to_stderr():
+    """Send to stderr what native code prints: stdout is for results."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    try:
+        os.dup2(2, 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 def _check_extensions(members, where):
@@ -117,7 +161,7 @@ def _read_archive(members, where, remarks):
             continue
         if zipped or kind in {*USD, *UNREAD, "zip"}:
             remarks.add("left out", name)
-        elif kind in trimesh.available_formats() or kind in NEEDED:
+        elif kind in trimesh.available_formats() or kind in NEEDED or kind in STEP:
             folder = name[: name.rfind("/") + 1]
             beside = {key.removeprefix(folder): other for key, other in members.items() if key.startswith(folder)}
             resolver = trimesh.resolvers.ZipResolver(beside)

@@ -1,0 +1,204 @@
+"""`warp-abtree clash` and `find_clashes`: parts of known geometry, python-fcl, files written, and bad input."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from helpers import refused
+from helpers.viewer import run_command as run
+from trimesh.transformations import rotation_matrix, translation_matrix
+
+import warp_abtree as ab
+from warp_abtree.app.cli.clash_command import CLASH_KINDS, find_clashes
+
+PLATE = trimesh.creation.annulus(5, 30, 10, sections=64)  # its hole of radius 5 is along z
+CUBE = trimesh.creation.box((10, 10, 10))
+
+
+def pin(radius, sections=64):
+    return trimesh.creation.cylinder(radius, 40, sections=sections)
+
+
+def tray(extents):
+    """A box without its lid."""
+    box = trimesh.creation.box(extents)
+    box.update_faces(box.face_normals[:, 2] < 0.5)
+    return box
+
+
+def scene_of(device, parts, solid="closed"):
+    source = trimesh.Scene()
+    for name, (mesh, *shift) in parts.items():
+        source.add_geometry(mesh, name, name, transform=translation_matrix(shift or (0, 0, 0)))
+    return ab.scene_from_trimesh(source, device=device, base_faces=10**6, solid=solid)
+
+
+# Two parts, within, and what is true of them: kind, distance, bounds of the depth, whether faces intersect.
+BARS = (trimesh.creation.box((100, 4, 4)), 0, 0, 0), (trimesh.creation.box((3, 90, 1)), 13, 3, 0.5)
+KNOWN = {
+    "press fit of 0.02": ((PLATE, 0, 0, 4), (pin(5.02),), "interference", 0, (0.0199, 0.0201), True),
+    "pin with play": ((PLATE, 0, 0, 4), (pin(4.75),), "clearance", 0.25 * np.cos(np.pi / 64), (0, 0), False),
+    "gap of 0.5": ((CUBE,), (CUBE, 0, 10.5, 0), "clearance", 0.5, (0, 0), False),
+    "walls in contact": ((CUBE,), (CUBE, 10, 3, 1), "touching", 0, (0, 0), True),
+    "an edge on a wall": (
+        (CUBE,),
+        (CUBE.copy().apply_transform(rotation_matrix(np.pi / 4, [0, 0, 1])), 5 + 50**0.5 - 1e-9, 0, 0),
+        "touching",
+        0,
+        (0, 1e-8),
+        True,
+    ),
+    "pressed in by 1": ((CUBE,), (trimesh.creation.box((4, 4, 4)), 0, 0, 6), "interference", 0, (0.999, 1.001), True),
+    "no corner inside": (*BARS, "interference", 0, (0.5, 2.0001), True),
+    "the same twice": ((CUBE,), (CUBE,), "interference", 0, (2, 5.001), True),
+    "one inside": ((CUBE,), (trimesh.creation.icosphere(2, 1.0),), "interference", 0, (4, 5), False),
+    "crossing trays": ((tray((10, 10, 10)),), (tray((3, 3, 20)),), "interference", 0, None, True),
+    "a sheet through a solid": ((CUBE,), (tray((90, 90, 2)), 20, -7, 0), "interference", 0, (3.5, 4.001), True),
+    "in an open tray": ((tray((10, 10, 10)),), (trimesh.creation.box((1, 1, 1)),), "clearance", 4.5, (0, 0), False),
+    "on an open tray": (
+        (tray((10, 10, 10)),),
+        (trimesh.creation.box((2, 2, 2)), 1, 0, -6),
+        "touching",
+        0,
+        (0, 0),
+        True,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", KNOWN)
+@pytest.mark.parametrize("turned", [False, True])
+def test_parts_of_known_geometry(device, case, turned):
+    """As they stand, exactly, and turned and moved together, which rounds coordinates."""
+    first, second, kind, distance, depth, meet = KNOWN[case]
+    scene = scene_of(device, {"a": first, "b": second})
+    if turned:
+        place = translation_matrix([3, -7, 20]) @ rotation_matrix(1.1, [1, 2, 3])
+        shifts = [translation_matrix(part[1:] or (0, 0, 0)) for part in (first, second)]
+        scene.set_poses(np.array([place @ shift for shift in shifts]))
+    (found,) = find_clashes(scene, within=6)
+    assert (found.first, found.second, found.kind, found.pair) == ("a", "b", kind, (0, 1))
+    assert found.distance == pytest.approx(distance, abs=1e-6)
+    if not turned or kind == "interference":
+        assert (found.faces > 0) == meet
+    assert found.open == tuple(name for name, part in {"a": first, "b": second}.items() if not part[0].is_watertight)
+    if depth is None:
+        assert found.penetration is None
+    else:
+        assert depth[0] - 1e-6 <= found.penetration <= depth[1] + 1e-6
+    nearer = find_clashes(scene, within=distance - 0.01) if distance else []
+    assert not nearer, "what is farther is left out"
+
+
+def test_order_and_tolerance(device):
+    parts = {"plate": (PLATE, 0, 0, 4), "pin": (pin(5.02),), "block": (CUBE, 20, 0, 14), "lid": (CUBE, 20, 0, 24.5)}
+    parts |= {"ball": (trimesh.creation.icosphere(2, 1.0), 20, 0, 14)}
+    scene = scene_of(device, parts)
+    expected = [
+        ("block", "ball", "interference"),
+        ("plate", "pin", "interference"),
+        ("plate", "block", "touching"),
+        ("block", "lid", "clearance"),
+    ]
+    assert [(c.first, c.second, c.kind) for c in find_clashes(scene, within=2)] == expected
+    kinds = {(c.first, c.second): c.kind for c in find_clashes(scene, tolerance=0.021)}
+    assert kinds == {("block", "ball"): "interference", ("plate", "pin"): "touching", ("plate", "block"): "touching"}
+    assert ("block", "lid") in {(c.first, c.second) for c in find_clashes(scene, tolerance=0.5)}
+    for name, value in (("within", -1), ("within", np.nan), ("tolerance", np.inf)):
+        refused(ValueError, f"{name}: .* is no distance of 0 or more", find_clashes, scene, **{name: value})
+
+
+def test_balls_have_the_kinds_and_distances_of_fcl(device):
+    fcl = pytest.importorskip("fcl")
+    rng = np.random.default_rng(4)
+    radii = np.array([0.5, 0.8, 1.1])
+    meshes = [trimesh.creation.icosphere(3, radius) for radius in radii]
+    centres = rng.uniform(0, 7, (24, 3))
+    scene = scene_of(device, {f"{i}": (meshes[i % 3], *centre) for i, centre in enumerate(centres)})
+    found = {clash.pair: clash for clash in find_clashes(scene, within=0.4)}
+    assert {clash.kind for clash in found.values()} == {"interference", "clearance"}
+    objects = []
+    for i, centre in enumerate(centres):
+        made = fcl.BVHModel()
+        made.beginModel(len(meshes[i % 3].vertices), len(meshes[i % 3].faces))
+        made.addSubModel(meshes[i % 3].vertices, meshes[i % 3].faces)
+        made.endModel()
+        objects.append(fcl.CollisionObject(made, fcl.Transform(centre)))
+    for i in range(24):
+        for j in range(i + 1, 24):
+            apart = fcl.distance(objects[i], objects[j], fcl.DistanceRequest(), fcl.DistanceResult())
+            (r, s), d = (radii[[i % 3, j % 3]], np.linalg.norm(centres[i] - centres[j]))
+            deep = max(s - abs(d - r), r - abs(d - s))  # of the deepest point of one sphere in the other
+            clash = found.pop((i, j), None)
+            assert (clash is None) == (apart > 0.4)
+            if clash is not None and apart > 0:
+                assert clash.kind == "clearance" and clash.distance == pytest.approx(apart, abs=1e-6)
+            elif clash is not None:
+                assert clash.kind == "interference" and abs(clash.penetration - deep) < 0.02
+    assert not found
+
+
+@pytest.fixture
+def assembly(tmp_path, monkeypatch):
+    """Work in a folder with an assembly of a press fit, a gap of 0.5, two that touch and an open part."""
+    monkeypatch.chdir(tmp_path)
+    source = trimesh.Scene()
+    parts = {"plate": (PLATE, 0, 0, 4), "pin": (pin(5.02), 0, 0, 0), "block": (CUBE, 20, 0, 14)}
+    parts |= {"lid": (CUBE, 20, 0, 24.5), "tray": (tray((9, 9, 9)), 0, 60, 0)}
+    for name, (mesh, *shift) in parts.items():
+        source.add_geometry(mesh, name, name, transform=translation_matrix(shift))
+    source.export("assembly.glb")
+    return source
+
+
+def test_command(assembly, capsys, device):
+    words = ("clash", "assembly.glb", "--within", 2, "--csv", "out.csv", "--glb", "out.glb", "--device", device)
+    shown = json.loads(run(capsys, *words, "--json", status=1)[0])
+    kinds = [(row["first"], row["second"], row["kind"]) for row in shown["pairs"]]
+    assert kinds == [
+        ("plate", "pin", CLASH_KINDS[0]),
+        ("plate", "block", CLASH_KINDS[1]),
+        ("block", "lid", CLASH_KINDS[2]),
+    ]
+    assert [shown[kind] for kind in CLASH_KINDS] == [1, 1, 1] and shown["open"] == ["tray"] and shown["objects"] == 5
+    assert shown["tolerance"] == pytest.approx(1e-6 * np.linalg.norm(np.ptp(assembly.bounds, axis=0)), rel=1e-6)
+    with open("out.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["first"], row["second"], row["kind"]) for row in rows] == kinds
+    assert float(rows[0]["penetration"]) == shown["pairs"][0]["penetration"] == pytest.approx(0.02, abs=1e-4)
+    assert float(rows[2]["distance"]) == pytest.approx(0.5, abs=1e-6)
+    written = trimesh.load_scene("out.glb")
+    assert sorted(written.graph.nodes_geometry) == sorted([*assembly.graph.nodes_geometry, "curves of contact"])
+    curves = written.geometry[written.graph["curves of contact"][1]]
+    assert np.linalg.norm(curves.vertices[:, :2], axis=1).max() < 5.03, "the pin's, not the block's"
+    text, _ = run(capsys, *words[:-4], "--device", device, status=1)
+    assert "plate" in text and "open " in text and "tolerance" in text
+    run(capsys, "clash", "assembly.glb", "--tolerance", 0.1, "--device", device, status=0)
+
+
+def test_picture_of_clashes(assembly, capsys):
+    pytest.importorskip("pyvista")
+    import PIL.Image
+
+    run(capsys, "clash", "assembly.glb", "--picture", "out.png", "--device", "cpu", status=1)
+    assert min(PIL.Image.open("out.png").size) > 100
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        ("gone.glb", "gone.glb: no such file"),
+        ("one.glb", "one.glb: holds one object alone"),
+        ("assembly.glb --within -1", "--within: -1.0 is no distance of 0 or more"),
+        ("assembly.glb --tolerance nan", "--tolerance: nan is no distance of 0 or more"),
+        ("assembly.glb --csv out.txt", "out.txt: the name must end in .csv"),
+        ("assembly.glb --glb assembly.glb", "assembly.glb: is read, so it is not overwritten"),
+        ("assembly.glb --csv no/out.csv", "no/out.csv: there is no folder no"),
+    ],
+)
+def test_bad_input(assembly, capsys, words, message):
+    CUBE.export("one.glb")
+    shown, errors = run(capsys, "clash", *words.split(), "--device", "cpu", status=2)
+    assert not shown and len(errors) == 1 and message in errors[0]
