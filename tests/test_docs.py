@@ -216,7 +216,8 @@ def test_examples_of_help_run(tmp_path, monkeypatch, capsys):
     pytest.importorskip("pxr")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
-    np.save("poses.npy", np.eye(7)[[6] * 3])
+    for name in ("poses", "ends"):
+        np.save(f"{name}.npy", np.eye(7)[[6] * 3])
     run = []
     for name in "build info query run sweep picture".split():
         with pytest.raises(SystemExit):

@@ -31,8 +31,9 @@ def dist(tmp_path_factory):
     pytest.importorskip("build", reason=reason)
     pytest.importorskip("setuptools", str(LEAST_SETUPTOOLS), reason=reason)
     folder = tmp_path_factory.mktemp("packaging")
-    left_out = shutil.ignore_patterns(".git", ".venv", "build", "dist", "*.egg-info", "__pycache__", ".*_cache")
+    left_out = shutil.ignore_patterns(".git", ".venv", "dist", "*.egg-info", "__pycache__", ".*_cache")
     shutil.copytree(ROOT, folder / "source", ignore=left_out)
+    shutil.rmtree(folder / "source" / "build", ignore_errors=True)  # kernels/build stays
     command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", folder / "dist", folder / "source"]
     subprocess.run(command, check=True, capture_output=True)
     return folder / "dist"

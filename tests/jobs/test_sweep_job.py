@@ -21,8 +21,10 @@ from helpers.jobs import (
     shard_at,
     stop_after,
 )
+from helpers.questions import to_matrix
 from helpers.samples import sample
 from helpers.viewer import run_command
+from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
 from warp_abtree.app.cli import sweep_command
@@ -58,6 +60,61 @@ def test_answers_are_those_of_a_scene(device, tmp_path, monkeypatch, output, kin
     for name in expected.contacts.dtype.names[2:] if output == "contacts" else ():
         np.testing.assert_array_equal(found[name], expected.contacts[name])
     assert len(found) == (3 if output == "faces" else 9)
+
+
+@pytest.mark.parametrize("matrices", [False, True])
+@pytest.mark.parametrize(
+    ("output", "options"),
+    [
+        ("any", {"within": 0.1}),
+        ("count", {"within": 0.1}),
+        ("any", {"solid": True}),
+        ("distance", {"beyond": 0.5, "tolerance": 1e-3}),
+        ("distance", {"solid": True}),
+        ("first_contact", {"tolerance": 1e-4}),
+        ("contacts", {}),
+    ],
+)
+def test_answers_are_those_of_a_call(device, tmp_path, output, options, matrices):
+    """Of all outputs that `sweep` has, in shards, of poses as quaternions or matrices, and by a command."""
+    poses, ends = poses_of(), poses_of(seed=4)
+    if matrices:
+        poses, ends = (np.array([to_matrix(*pose_matrix(row)) for row in rows]) for rows in (poses, ends))
+    names = {"poses": poses, **({"ends": ends} if output == "first_contact" else {})}
+    for name, rows in names.items():
+        np.save(tmp_path / f"{name}.npy", rows)
+    paths = {"end_poses": tmp_path / "ends.npy"} if output == "first_contact" else {}
+    done = run(
+        SweepJob(*pair(), tmp_path / "poses.npy", output=output, shard=27, **options, **paths), tmp_path / "out", device
+    )
+    found = read(tmp_path / "out")
+    if output == "contacts":
+        assert done["intersecting"] == len(np.unique(found["pose"]))
+        return
+    asked = {"end_poses": ends} if output == "first_contact" else {}
+    expected = ab.sweep(*pair(), poses, output=output, device=device, **options, **asked)
+    columns = expected.dtype.names or (output,)
+    assert set(found) == set(columns)
+    for name in columns:
+        np.testing.assert_array_equal(found[name], expected[name] if expected.dtype.names else expected)
+    meets = {"distance": lambda: expected["distance"] <= 0, "first_contact": lambda: ~expected["clear"]}
+    truth = meets.get(output, lambda: found[output] > 0)()
+    assert done["intersecting"] == np.count_nonzero(truth) and 0 < done["intersecting"] < 100
+
+
+def test_options_of_other_outputs_are_refused():
+    for options, message in (
+        ({"beyond": 1.0}, "beyond means nothing for output 'any'"),
+        ({"output": "contacts", "solid": True}, "contacts: not with solid"),
+        ({"output": "distance", "lods": np.zeros((60, 2), int)}, "lods and contacts: not with output 'distance'"),
+        ({"output": "distance", "tolerance": -1.0}, "tolerance"),
+        ({"output": "first_contact"}, "end_poses: needed"),
+        ({"end_poses": poses_of(60)}, "end_poses: needed for output 'first_contact' alone"),
+        ({"output": "first_contact", "end_poses": poses_of(59)}, "59 given for 60"),
+        ({"output": "first_contact", "end_poses": np.zeros((60, 7))}, "end_poses: pose 0"),
+        ({"output": "nothing"}, "output 'nothing'"),
+    ):
+        refused(ValueError, message, SweepJob, *pair(), poses_of(60), **options)
 
 
 def test_tree_states_of_the_scene_have_bounded_memory(monkeypatch):

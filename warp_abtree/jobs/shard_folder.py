@@ -22,6 +22,8 @@ SHARD_FORMAT, SHARD_VERSION = "warp_abtree shards", 2
 MANIFEST = "job.json"
 SHARD_NAME = re.compile(r"shard-\d{12,}-\d{12,}\.npz")
 WRITTEN = re.compile(rf"{re.escape(MANIFEST)}|{SHARD_NAME.pattern}")
+# Outputs of which a row is a pose, and the column that tells whether it intersects.
+POSE_OUTPUTS = {"any": "any", "count": "count", "distance": "distance", "first_contact": "clear"}
 STAMP_FIELDS = ("job", "range", "digest")
 
 
@@ -98,8 +100,8 @@ class ShardFolder:
 def read_shards(out) -> Iterator[tuple[int, int, dict]]:
     """Yield (start, stop, columns) of each shard of a finished job, in order; columns are arrays by name.
 
-    For "any" and "count" a row is a pose, from `start` on; for "faces" and "contacts" a face pair, with its pose in the
-    column `pose`. Each shard is checked first.
+    A row is a pose, from `start` on, with the columns of `sweep`; for "faces" and "contacts" a face pair, with its pose
+    in the column `pose`. Each shard is checked first.
 
     Raises:
         ValueError: No such folder, shards are missing, or a shard is damaged, altered or of another job; it names the
@@ -183,15 +185,19 @@ def _row_fault(job, lengths, start, stop) -> str | None:
     if len(lengths) != 1:
         return "columns of different lengths" if lengths else "no columns"
     rows, expected = min(lengths), stop - start
-    if job.get("output") in ("any", "count") and rows != expected:  # a row per pose
+    if job.get("output") in POSE_OUTPUTS and rows != expected:
         return f"{rows} rows, not {expected}"
     return None
 
 
 def _count_poses(job, name, values) -> int:
-    """Return how many poses intersect by a column: yes or no, a number, or the pose of each row, in order."""
-    if job["output"] in ("any", "count"):
-        return int(np.count_nonzero(values)) if name == job["output"] else 0
+    """Return how many poses intersect by a column: yes or no, a number, or the pose of each row, in order.
+
+    Of motions those that are not proved clear.
+    """
+    if job["output"] in POSE_OUTPUTS:
+        meets = {"distance": lambda found: found <= 0, "clear": np.logical_not}.get(name, np.asarray)
+        return int(np.count_nonzero(meets(values))) if name == POSE_OUTPUTS[job["output"]] else 0
     return int(np.count_nonzero(values[1:] != values[:-1])) + bool(len(values)) if name == "pose" else 0
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from warp_abtree.checks.arguments import to_numpy, whole_number
+from warp_abtree.checks.arguments import flag, to_numpy, whole_number
 from warp_abtree.model.model import Model
-from warp_abtree.query.request import check_request
+from warp_abtree.query.request import check_options
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep import sweep
 from warp_abtree.state.poses import check_poses
@@ -20,8 +20,13 @@ READ_ROWS = SHARD = 65536
 SCENE_POSES, STATE_BYTES, BYTES_A_FACE = 4096, 2**28, 190
 
 
+# Options that outputs take beside solid.
+JOB_OPTIONS = {"any": ("within",), "count": ("within",), "faces": (), "contacts": ()}
+JOB_OPTIONS |= {"distance": ("tolerance", "beyond"), "first_contact": ("tolerance",)}
+
+
 class _Rows:
-    """Rows of numbers in memory, or in an .npy file that is read in parts."""
+    """Rows of numbers in memory, or in an .npy file that is read in parts: (p, width), of poses (p, 4, 4) too."""
 
     def __init__(self, source, what, width):
         self.what, of_file = what, isinstance(source, str | os.PathLike)
@@ -30,8 +35,10 @@ class _Rows:
         rows = self._open()
         if rows.dtype.kind not in "iuf":
             raise ValueError(f"{what}: type {rows.dtype} holds no real numbers")
-        if rows.ndim != 2 or rows.shape[1] != width:
-            raise ValueError(f"{what}: shape {rows.shape}, not (p, {width})")
+        matrices = width == 7 and rows.ndim == 3 and rows.shape[1:] == (4, 4)
+        if not matrices and (rows.ndim != 2 or rows.shape[1] != width):
+            wanted = f"(p, {width})" if width != 7 else "(p, 7) or (p, 4, 4)"
+            raise ValueError(f"{what}: shape {rows.shape}, not {wanted}")
         self.dtype, self.count = rows.dtype, len(rows)
 
     def _open(self) -> np.ndarray:
@@ -72,12 +79,15 @@ class SweepJob:
 
     Args:
         model_a, model_b: `Model`; may be the same.
-        poses: (p, 7) as for `sweep`, an array or the path of an .npy file.
+        poses: (p, 7) or (p, 4, 4) as for `sweep`, an array or the path of an .npy file.
         lods: LODs of A and B: (2,) for all poses, or (p, 2), an array or the path of an .npy file; None is the finest.
             Poses with the LODs of nearby poses are faster.
-        output: "any", "count", "faces" or "contacts".
+        output: "any", "count", "faces", "contacts", "distance" or "first_contact".
         precision: As for `sweep`.
         shard: Poses per shard.
+        end_poses: As poses, for "first_contact" alone.
+        solid, within, tolerance, beyond: As for `sweep`; with these, "distance" and "first_contact" LODs are those of
+            all poses.
 
     Attributes:
         count: Poses.
@@ -87,11 +97,28 @@ class SweepJob:
         ValueError: Bad poses or LODs (the message names the first), or an unknown option.
     """
 
-    def __init__(self, model_a, model_b, poses, lods=None, output="any", precision="exact", shard=SHARD):
+    def __init__(
+        self,
+        model_a,
+        model_b,
+        poses,
+        lods=None,
+        output="any",
+        precision="exact",
+        shard=SHARD,
+        *,
+        end_poses=None,
+        solid=False,
+        within=None,
+        tolerance=None,
+        beyond=None,
+    ):
         for model in (model_a, model_b):
             if not isinstance(model, Model):
                 raise TypeError(f"model is a {type(model).__name__}, not a Model: Model.load makes one")
-        check_request("faces" if output == "contacts" else output, precision)
+        given = {"within": within, "tolerance": tolerance, "beyond": beyond}
+        self.options = check_options(JOB_OPTIONS, output, precision, given)
+        self.options |= {"solid": True} if flag(solid, "solid") else {}
         self.models = (model_a, model_b)
         self.output, self.precision = output, precision
         self.shard = whole_number(shard, "shard", 1, 2**31 - 1)
@@ -102,6 +129,17 @@ class SweepJob:
             self.lods = _Rows(lods, "lods", 2)
         self.poses = _Rows(poses, "poses", 7)
         self.count = self.poses.count
+        self.ends = None if end_poses is None else _Rows(end_poses, "end_poses", 7)
+        if (self.ends is None) != (output != "first_contact"):
+            raise ValueError(f"end_poses: needed for output 'first_contact' alone, which is {output!r}")
+        if self.ends is not None and self.ends.count != self.count:
+            raise ValueError(f"end_poses: {self.ends.count} given for {self.count} poses")
+        if self.options or output in ("distance", "first_contact"):
+            if self.lods is not None or output == "contacts":
+                raise ValueError(f"lods and contacts: not with {', '.join(self.options) or f'output {output!r}'}")
+            none = np.empty((0, 7))  # the options are checked all the same
+            asked = {**self.options, "end_poses": None if self.ends is None else none}
+            sweep(model_a, model_b, none, output=output, device="cpu", **asked)
         if self.lods is not None and self.lods.count != self.count:
             raise ValueError(f"lods: {self.lods.count} given for {self.count} poses")
         self._known = {
@@ -114,6 +152,11 @@ class SweepJob:
             "output": output,
             "precision": precision,
         }
+        if self.ends is not None:
+            checked = self.ends.hash_checked(lambda start, rows: check_poses(rows, "end_poses", start))
+            self._known["end_poses"] = checked
+        if self.options:
+            self._known["options"] = self.options
 
     def _check_lods(self, start, rows):
         top = np.array([model.lod_max for model in self.models])
@@ -129,18 +172,20 @@ class SweepJob:
     def task(self, start, stop):
         """Return the input of one shard, sent to a worker."""
         lods = None if self.lods is None else self.lods.read(start, stop).astype(np.int64)
-        return start, self.poses.read(start, stop), lods
+        ends = None if self.ends is None else self.ends.read(start, stop)
+        return start, self.poses.read(start, stop), lods, ends
 
     def runner(self) -> "SweepRunner":
         """Return the task runner, sent to each worker once."""
-        return SweepRunner(self.models, self.fixed, self.output, self.precision)
+        return SweepRunner(self.models, self.fixed, self.output, self.precision, self.options)
 
 
 class SweepRunner:
     """Task runner of a `SweepJob` on one device; pickled without its scene."""
 
-    def __init__(self, models, fixed, output, precision):
+    def __init__(self, models, fixed, output, precision, options):
         self.models, self.fixed, self.output, self.precision = models, fixed, output, precision
+        self.options = options
         self._scene: Any = None  # made at the first use
 
     def __getstate__(self):
@@ -148,11 +193,13 @@ class SweepRunner:
 
     def run(self, task, device=None) -> dict:
         """Return the columns of a shard, arrays of one length."""
-        start, poses, lods = task
+        start, poses, lods, ends = task
         if lods is None and self.output != "contacts":
-            options = {"output": self.output, "precision": self.precision, "device": device}
+            options = {"output": self.output, "precision": self.precision, "device": device, "end_poses": ends}
             (model_a, model_b), (lod_a, lod_b) = self.models, self.fixed
-            found = sweep(model_a, model_b, poses, lod_a, lod_b, **options)
+            found = sweep(model_a, model_b, poses, lod_a, lod_b, **options, **self.options)
+            if found.dtype.names:
+                return {name: np.ascontiguousarray(found[name]) for name in found.dtype.names}
             return {self.output: found} if self.output != "faces" else _name_faces(found, start)
         parts = []
         room = self._make_scene(len(poses), device)
@@ -184,8 +231,7 @@ class SweepRunner:
     def _intersect(self, poses, lods, room):
         """Intersect A and B at up to `room` poses; the other objects stay at the origin."""
         count = len(poses)
-        placed = np.zeros((2 * room, 7))
-        placed[:, 6] = 1.0
+        placed = np.tile(np.eye(4) if poses.ndim == 3 else np.eye(7)[6], (2 * room, *[1] * (poses.ndim - 1)))
         placed[room : room + count] = poses
         self._scene.set_poses(placed)
         if lods is not None:

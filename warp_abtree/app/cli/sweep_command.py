@@ -17,6 +17,8 @@ SUMMARY = "ask a pair of models at millions of poses, into shards"
 EXAMPLES = (
     "bunny.npz bunny.npz poses.npy --out answers",
     "bunny.npz warp:bear poses.npy --output contacts --workers 2 --out contacts",
+    "bunny.npz warp:bear poses.npy --output distance --beyond 0.1 --out near",
+    "bunny.npz warp:bear poses.npy --output first_contact --ends ends.npy --out times",
 )
 
 
@@ -26,15 +28,22 @@ def add_arguments(sub: Parser):
         "source",
         nargs="+",
         metavar="SCENE_OR_MODELS",
-        help="two meshes or models and POSES.npy, (p, 7) poses of the second in the frame of the first; or a scene of "
-        "two objects and POSES.npy",
+        help="two meshes or models and POSES.npy, (p, 7) or (p, 4, 4) poses of the second in the frame of the first; "
+        "or a scene of two objects and POSES.npy",
     )
     sub.add_file("--out", "-o", type=Path, required=True, metavar="DIR", help="folder to make, or to go on in")
-    sub.add_argument("--output", choices=OUTPUTS, default="any", help="what to ask (any)")
+    sub.add_argument("--output", choices=(*OUTPUTS, "first_contact"), default="any", help="what to ask (any)")
     sub.add_argument("--precision", choices=PRECISION_NAMES, default="exact", help="as query (exact)")
     for name in ("a", "b"):
         sub.add_argument(f"--lod-{name}", metavar="LOD", help=f"LOD of {name.upper()}, as query (finest)")
     sub.add_file("--lods", type=Path, metavar="LODS.npy", help="LODs of both at each pose, (p, 2)")
+    sub.add_file("--ends", type=Path, metavar="ENDS.npy", help="end poses of first_contact, as POSES.npy")
+    sub.add_argument("--solid", action="store_true", help="what lies inside A or B, closed meshes, intersects it")
+    about = "whether any or count are proved farther apart than X, too"
+    sub.add_argument("--within", type=float, metavar="X", help=about)
+    about = "what a distance, or a time of first contact, may be off by (0, 1e-6)"
+    sub.add_argument("--tolerance", type=float, metavar="X", help=about)
+    sub.add_argument("--beyond", type=float, metavar="X", help="distance that is far enough (none)")
     sub.add_argument("--shard", type=positive_count, default=65536, metavar="N", help="poses a file (65536)")
     sub.add_argument(
         "--ray",
@@ -95,6 +104,7 @@ def _make_job(options, progress) -> SweepJob:
             raise ValueError("--lods: LODs come from the file, or from --lod-a and --lod-b")
         if request is not None:
             lods[place] = lod_at(f"--lod-{'ab'[place]}", models[place], request)
-    asked = {"output": options.output, "precision": options.precision}
+    asked = {"output": options.output, "precision": options.precision, "end_poses": options.ends}
+    asked |= {name: getattr(options, name) for name in ("solid", "within", "tolerance", "beyond")}
     model_a, model_b = models
     return SweepJob(model_a, model_b, poses, options.lods or lods, shard=options.shard, **asked)

@@ -1,6 +1,6 @@
 """Grasps of a two-finger gripper on a mug: which poses are free, and what the fingers hold when they have closed.
 
-python scenes/grasps.py draws the narrowest one to grasps.png (docs/programs.md).
+python scenes/programs/grasps.py draws the narrowest one to grasps.png (docs/programs.md).
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
 """A clash report of an assembly of 50 parts: which parts interfere and how far one has to move, which are too close.
 
-python scenes/clash_report.py writes clashes.csv and clash_report.png (docs/programs.md). On files, without a program:
-`warp-abtree clash ASSEMBLY --within 2`.
+python scenes/programs/clash_report.py writes clashes.csv and clash_report.png (docs/programs.md); of a file,
+without a program: `warp-abtree clash ASSEMBLY --within 2`.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """256 worlds of Newton, in each a ring that falls over a peg a little aside: contacts between the meshes themselves.
 
-python scenes/newton_worlds.py draws four worlds at the end to newton_worlds.png (docs/programs.md); extra `newton`.
+python scenes/programs/newton_worlds.py draws four to newton_worlds.png (docs/programs.md); extra `newton`.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """An arm that holds a cup in a cluttered shelf: which configurations are free, what blocks the others, a free way.
 
-python scenes/arm_in_a_shelf.py draws a free configuration to arm_in_a_shelf.png (docs/programs.md); extra `robot`.
+python scenes/programs/arm_in_a_shelf.py draws one to arm_in_a_shelf.png (docs/programs.md); extra `robot`.
 """
 
 from pathlib import Path

@@ -1,6 +1,6 @@
 """A loop of one's own with 400 objects within 8 ms a frame: LODs are chosen by what it looks at, answers drive it.
 
-python scenes/own_loop.py draws the last frame to own_loop.png (docs/programs.md).
+python scenes/programs/own_loop.py draws the last frame to own_loop.png (docs/programs.md).
 """
 
 import gc
