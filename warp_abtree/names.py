@@ -18,6 +18,7 @@ from warp_abtree.query.stages.intersect import Query
 from warp_abtree.query.stages.motion import FirstContactQuery
 from warp_abtree.query.stages.points import ManifoldQuery
 from warp_abtree.scene.pipeline import Pipeline
+from warp_abtree.scene.point_distance import contains, signed_distance
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep import sweep
 from warp_abtree.simulate.frame import Frame
@@ -54,8 +55,10 @@ __all__ = [
     "Robot",
     "Scene",
     "ToleranceController",
+    "contains",
     "scene_from_file",
     "scene_from_trimesh",
+    "signed_distance",
     "sweep",
     "to_trimesh",
     "wrap_array",

@@ -11,9 +11,10 @@ from warp_abtree.app.cli.report import check_output, plain, print_result
 from warp_abtree.app.pictures.render import import_pyvista
 from warp_abtree.app.pictures.scenes import draw_clashes
 from warp_abtree.checks.atomic_write import atomic_write
+from warp_abtree.checks.quaternions import matrices_of
 from warp_abtree.interop.scenes import scene_from_file, to_trimesh
-from warp_abtree.model.model import Model
 from warp_abtree.query.result import Result
+from warp_abtree.scene.point_distance import signed_distance
 from warp_abtree.scene.scene import Scene
 
 SUMMARY = "list the pairs of parts of an assembly that interfere, touch or are close"
@@ -25,7 +26,7 @@ EXAMPLES = (
 CLASH_KINDS = ("interference", "touching", "clearance")
 TOUCH_TOLERANCE = 1e-6  # of the assembly's diagonal: files hold coordinates in float32
 DEPTH_SAMPLES = 16  # faces of each object of a pair at which depths are looked for beside those of the query
-PROBE = 1e-9  # of the assembly's diagonal: edges of the triangle that stands for a point
+PROBE = 1e-9  # of the assembly's diagonal: the first step under a wall
 UNBUILT = 2**31  # base faces: no levels of detail are asked for
 
 
@@ -116,7 +117,7 @@ def _sampled_depths(scene, met: Result, asked, size, tolerance) -> np.ndarray:
     samples = [_samples(met.contacts, asked, side) for side in (0, 1)]
     for side, (place, point, _) in enumerate(samples):
         other = met.pairs[place, 1 - side]
-        found = _depths(scene, pose_of, other[solid[other]], point[solid[other]], size)
+        found = _depths(scene, pose_of, other[solid[other]], point[solid[other]])
         np.maximum.at(depth, place[solid[other]], found)
     place, point, normal = (np.concatenate(parts) for parts in zip(*samples))
     flat = (depth[place] <= tolerance) & solid[met.pairs[place]].all(1)
@@ -124,7 +125,7 @@ def _sampled_depths(scene, met: Result, asked, size, tolerance) -> np.ndarray:
     normal, step = np.concatenate([normal[flat], -normal[flat]]), 4 * (tolerance or PROBE * size)
     while len(place) and step < size:
         below = point + step * normal
-        deep = np.minimum(*(_depths(scene, pose_of, met.pairs[place, side], below, size) for side in (0, 1)))
+        deep = np.minimum(*(_depths(scene, pose_of, met.pairs[place, side], below) for side in (0, 1)))
         np.maximum.at(depth, place, deep)
         on = deep > step / 2
         place, point, normal, step = place[on], point[on], normal[on], 2 * step
@@ -147,17 +148,14 @@ def _samples(contacts, asked, side: int):
     return keys[some, 0], means[some], rows[f"normal_{'ab'[side]}"][first[some]]
 
 
-def _depths(scene, pose_of, objects, points, size) -> np.ndarray:
+def _depths(scene, pose_of, objects, points) -> np.ndarray:
     """Return how deep points (n, 3) lie in solid objects (n,) [world units], 0 for those outside."""
-    if not len(points):
-        return np.zeros(0)
-    held, owner = np.unique(objects, return_inverse=True)
-    asked, triangle = Scene(scene.device), PROBE * size * np.eye(3)
-    asked.add_many([scene.models[scene.object_model[i]] for i in held], pose_of[held], solids=True)
-    probe = Model.from_arrays(triangle - triangle.mean(0), [[0, 1, 2]], cache=False)
-    probes = asked.add_many(probe, np.pad(points, ((0, 0), (0, 4)), constant_values=1.0) * [1, 1, 1, 0, 0, 0, 1])
-    found = asked.intersect(np.stack([owner.reshape(-1), probes], 1), "distance", signed=True, beyond=0.0)
-    return np.maximum(-found.distance, 0.0)
+    depth = np.zeros(len(points))
+    for i in np.unique(objects).tolist():
+        rows, turn = objects == i, matrices_of(pose_of[i : i + 1, 3:])[0]
+        model, lod = scene.models[scene.object_model[i]], int(scene.lods[i])
+        depth[rows] = -signed_distance(model, (points[rows] - pose_of[i, :3]) @ turn, lod, scene.device.alias)
+    return np.maximum(depth, 0.0)
 
 
 def add_arguments(sub: Parser):

@@ -1,0 +1,107 @@
+"""Distances of points from a model and sides of closed ones, against fractions, integers and brute force."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from helpers import refused
+from helpers.samples import sample
+from helpers.solids import model_of, shell, turned, voxel_mesh
+from oracles.distance import brute_distances, exact_distance_sq
+from oracles.inside import parity
+
+import warp_abtree as ab
+from warp_abtree.model.mesh import MeshError
+from warp_abtree.scene import point_distance
+
+NAMES = ("torus", "soup", "lattice soup", "crumbs", "one", "twins", "small ball")
+
+
+def points_about(rng, corners, count):
+    """Return points around and far from triangles, near them, and on their corners, edges and insides."""
+    low, size = corners.min((0, 1)), np.ptp(corners, axis=(0, 1)).max()
+    weights = rng.dirichlet((1, 1, 1), count) * (rng.random((count, 3)) < 0.7)
+    weights[weights.sum(1) == 0, 0] = 1.0
+    on = np.einsum("nk,nkx->nx", weights / weights.sum(1, keepdims=True), corners[rng.integers(0, len(corners), count)])
+    near = on + rng.normal(size=on.shape) * size * 10.0 ** rng.uniform(-16, -1, (count, 1))
+    around = low + size * rng.uniform(-0.5, 1.5, (count, 3))
+    return np.concatenate([around, near, on, corners.reshape(-1, 3)[:count], 1e6 * size * around[: count // 4]])
+
+
+@pytest.mark.parametrize(
+    ("name", "scale"), [*((name, 1.0) for name in NAMES), ("soup", 1e-6), ("small ball", 1e6), ("twins", 1e6)]
+)
+def test_distances_equal_brute_force(device, name, scale):
+    """At every part of the LODs; the nearest point lies on the face that is named, as far away."""
+    rng, mesh = np.random.default_rng(3), sample(name).mesh_at(sample(name).lod_max)
+    model = ab.Model.from_arrays(mesh[0] * scale + 3 * scale, mesh[1], base_faces=4)
+    for lod in {0, model.lod_max // 2, model.lod_max}:
+        vertices, faces, face_ids = model.mesh_at(lod)
+        corners = vertices[faces]
+        points = points_about(rng, corners, 24)
+        found, nearest, face = ab.signed_distance(model, points, lod, device, signed=False, nearest=True)
+        slack = 2.0**-44 * (np.abs(points).max(1) + 10 * scale)
+        assert (np.abs(found - brute_distances(points, corners)) <= slack).all()
+        assert (np.abs(np.linalg.norm(points - nearest, axis=1) - found) <= slack).all()
+        row = {face: k for k, face in enumerate(face_ids.tolist())}
+        on = corners[[row[k] for k in face.tolist()]]
+        assert all(brute_distances(nearest[k : k + 1], on[k : k + 1]) <= slack[k] for k in range(len(points)))
+    for k in rng.integers(0, len(points), 12):
+        exact = exact_distance_sq([Fraction(x) for x in points[k].tolist()], corners)
+        assert abs(Fraction(found[k]) - Fraction(float(exact) ** 0.5)) <= slack[k]
+
+
+@pytest.mark.parametrize("kind", ["cube", "shell", "cells", "turned", "torus", "low torus"])
+def test_sides_are_exact(device, kind):
+    """Of points on the lattice too, in line with edges and corners, and next to a wall; faces may be wound any way."""
+    rng = np.random.default_rng(7)
+    if "torus" in kind:
+        model = sample("torus")
+        lod = model.lod_max if kind == "torus" else model.lod_max // 4
+    else:
+        cells = {"cube": [(0, 0, 0)], "shell": shell(4)}.get(kind, rng.integers(0, 4, (12, 3)))
+        vertices, faces = voxel_mesh(cells, rng)
+        model = model_of((vertices, turned(faces, rng.random(len(faces)) < 0.5) if kind == "turned" else faces))
+        lod = model.lod_max
+    vertices, faces, _ = model.mesh_at(lod)
+    corners = vertices[faces]
+    low, high = vertices.min(0), vertices.max(0)
+    size = (high - low).max()
+    middles = np.floor(rng.uniform(low - 1, high + 1, (60, 3))) + rng.choice([0.5, 0.25, 0.0], (60, 3))
+    wall = corners[rng.integers(0, len(corners), 60)].mean(1)
+    wall += rng.normal(size=wall.shape) * size * 10.0 ** rng.uniform(-13, -3, (60, 1))
+    points = np.concatenate([middles, wall, rng.uniform(low - 0.1 * size, high + 0.1 * size, (60, 3))])
+    points = points[brute_distances(points, corners) > 1e-13 * size][:: 1 + len(faces) // 300]
+    truth = np.array([parity(point, corners) for point in points])
+    assert truth.any() and not truth.all()
+    found = ab.signed_distance(model, points, lod, device)
+    assert np.array_equal(found < 0, truth) and np.array_equal(ab.contains(model, points, lod, device), truth)
+    np.testing.assert_array_equal(np.abs(found), ab.signed_distance(model, points, lod, device, signed=False))
+
+
+def test_points_do_not_see_one_another(device, monkeypatch):
+    """The same bits in any order, alone, and whatever the points of a thread."""
+    rng, model = np.random.default_rng(1), sample("torus")
+    points = np.concatenate([rng.uniform(-1, 1, (300, 3)), np.zeros((3, 3)), rng.uniform(-1e-3, 1e-3, (50, 3))])
+    whole = ab.signed_distance(model, points, device=device, nearest=True)
+    for run in (1, 7, 1000):
+        monkeypatch.setattr(point_distance, "RUNS", {"cpu": run, "cuda": run})
+        order = rng.permutation(len(points))
+        for part, other in zip(whole, ab.signed_distance(model, points[order], device=device, nearest=True)):
+            assert part[order].tobytes() == other.tobytes()
+    for k in (0, 120, 301):
+        assert ab.signed_distance(model, points[k : k + 1], device=device)[0] == whole[0][k]
+    assert ab.signed_distance(model, np.empty((0, 3)), device=device).shape == (0,)
+    assert ab.contains(model, np.float32([[0, 0, 0]]), device=device).dtype == bool
+
+
+def test_bad_points_and_models_are_refused(device):
+    ball, still = sample("small ball"), np.zeros((2, 3))
+    refused(ValueError, "points: shape", ab.signed_distance, ball, np.zeros(3), device=device)
+    refused(ValueError, "points: shape", ab.contains, ball, np.zeros((2, 4)), device=device)
+    refused(ValueError, "point 1 is not finite", ab.contains, ball, [[0, 0, 0], [0, np.nan, 0]], device=device)
+    refused(ValueError, "LOD", ab.contains, ball, still, ball.lod_max + 1, device)
+    refused(ValueError, "no device", ab.contains, ball, still, None, "cuda:99")
+    refused(ValueError, "signed", ab.signed_distance, ball, still, signed=1)
+    refused(TypeError, "not a Model", ab.contains, "ball.obj", still)
+    refused(MeshError, "closed", ab.signed_distance, sample("soup"), still, device=device)

@@ -1,0 +1,106 @@
+"""Points against one model: signed distances, nearest points and faces, containment.
+
+A closed surface divides space into inside and outside however it is wound, at every LOD; sides are decided exactly, by
+the parity of the crossings of a ray, as those of solids (`warp_abtree.state.solids`). A distance errs by 2^-45 of the
+sizes of model and point at most; a point on the surface has distance 0, or that error on either side.
+"""
+
+import weakref
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import check_device, flag, to_numpy
+from warp_abtree.kernels.inside import point_distance as kernels
+from warp_abtree.model.model import Model
+from warp_abtree.model.winding import check_solid
+from warp_abtree.scene.objects import check_models
+from warp_abtree.scene.scene import Scene
+
+# Points of a thread: the next starts from the last one's nearest face.
+RUNS = {"cpu": 256, "cuda": 8}
+# Models whose device arrays are kept for the next call.
+KEPT_MODELS = 4
+
+_kept: dict[tuple, tuple] = {}
+
+
+def signed_distance(model: Model, points, lod=None, device=None, signed: bool = True, nearest: bool = False):
+    """Return the distances of points from a model's surface, negative inside. Waits for the device.
+
+    Args:
+        points: (n, 3) in the model's frame [model units], of any framework.
+        lod: LOD of the model; None is the finest.
+        device: Warp device; None for Warp's default.
+        signed: Whether insides count; False takes meshes that are not closed, too.
+        nearest: Whether to return the nearest points on the surface and their faces as well.
+
+    Returns:
+        Distances, float64 (n,); with `nearest` also points, float64 (n, 3), and faces of the file, int32 (n,).
+
+    Raises:
+        TypeError: model is no Model.
+        MeshError: The mesh is not closed and has no inside; the message names edges.
+        ValueError: Points of another shape or not finite, the first is named; a LOD out of range, no such device.
+    """
+    (model,) = check_models(model, 1)
+    if flag(signed, "signed"):
+        check_solid(model.winding, model.name, stacklevel=3)
+    return_nearest, lod = flag(nearest, "nearest"), model.lod_max if lod is None else model.check_lod(lod)
+    points = _check_points(points)
+    scene = _find_scene(model, lod, device)
+    check_device(scene.device, "ab.signed_distance")
+    batch, n = scene.batch(), len(points)
+    made = {name: wp.empty(n, dtype=dtype, device=scene.device) for name, dtype in OUTPUTS.items()}
+    if n:
+        rows = wp.array(points, dtype=wp.vec3d, device=scene.device)
+        run = RUNS["cpu" if scene.device.is_cpu else "cuda"]
+        inputs = [run, signed, batch.trees, rows, _sort(model, points, rows), *made.values()]
+        wp.launch(kernels.measure_point_kernel, -(-n // run), inputs, device=scene.device, block_dim=64)
+    distance, face, point = (array.numpy() for array in made.values())
+    return (distance, point, face) if return_nearest else distance
+
+
+def contains(model: Model, points, lod=None, device=None) -> np.ndarray:
+    """Return which points lie inside a closed model, bool (n,); arguments and errors are those of `signed_distance`."""
+    return signed_distance(model, points, lod, device) < 0
+
+
+OUTPUTS = {"distance": wp.float64, "face": wp.int32, "nearest": wp.vec3d}
+
+
+def _check_points(points) -> np.ndarray:
+    points = to_numpy(points, "points")
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "iuf":
+        raise ValueError(f"points: shape {points.shape} and type {points.dtype}, not numbers of shape (n, 3)")
+    points = points.astype(np.float64, order="C")
+    sound = np.isfinite(points).all(1)
+    if not sound.all():
+        raise ValueError(f"points: point {sound.argmin()} is not finite")
+    return points
+
+
+def _sort(model, points, rows) -> wp.array:
+    """Return indices of points along a Morton curve through a box around model and points."""
+    vertices = model.mesh_at(0)[0]
+    lower, upper = (f(np.concatenate([vertices, points]), axis=0) for f in (np.min, np.max))
+    cell = float((upper - lower).max()) / 2 ** int(kernels.CODE_BITS)
+    code, order = (wp.empty(2 * len(points), dtype=wp.int32, device=rows.device) for _ in range(2))
+    inputs = [wp.vec3d(lower), wp.float64(cell or 1.0), rows, code, order]
+    wp.launch(kernels.code_point_kernel, len(points), inputs, device=rows.device)
+    wp.utils.radix_sort_pairs(code, order, len(points))
+    return order
+
+
+def _find_scene(model, lod, device) -> Scene:
+    """Return a scene of one object at an LOD, which is kept while its model lives, or three others are asked."""
+    scene = Scene(device)
+    key = id(model), lod, scene.device.alias
+    kept = _kept.pop(key, None)
+    if kept is None:
+        scene.add(model, lod=lod)
+        kept = scene, weakref.ref(model, lambda _: _kept.pop(key, None))
+    _kept[key] = kept
+    for old in list(_kept)[:-KEPT_MODELS]:
+        _kept.pop(old, None)
+    return kept[0]
