@@ -5,12 +5,18 @@ search starts anew (fresh) or from the faces of the launch before (again); on th
 from pose to pose, each a call of `Scene.set_poses` and `DistanceQuery.run` (calls). On the CPU all on one core, beside
 python-fcl, whose answers must be ours but for rounding.
 
+The part `points` is signed distances of random points, a tenth of them within a hundredth of the size of the surface,
+beside Warp's query of a mesh with signs by winding numbers, both a whole call; of meshes that are not closed without
+signs.
+
 The part `gap` is contacts with a gap beside contacts without, of knots: times by gap, and how many more.
 """
 
+import contextlib
 import time
 
 import numpy as np
+import trimesh
 import warp as wp
 
 import warp_abtree as ab
@@ -18,16 +24,17 @@ import warp_abtree as ab
 from .. import shapes
 from ..baselines.fcl import Fcl
 from ..meshes import ModelFolder, knot_model, mesh_file
-from ..timing import medians, no_garbage_collection, one_core, ratio_of, time_in_turn
+from ..timing import medians, no_garbage_collection, one_core, ratio_of, time_call, time_in_turn, time_rounds
 from .assembly import place_nut
 
 FULL = {"poses": 32, "counts": (1, 1024, 65536), "knot": 5000, "repeats": 7}
 CPU = FULL | {"counts": (1, 1024)}
 QUICK = {"poses": 3, "counts": (3,), "knot": 300, "repeats": 1}
+POINTS, POINT_MESHES = 100_000, ("cow", "homer", "stanford-bunny")
 GAP_FULL = shapes.KNOT_PAIRS | {"pairs": (64, 1024, 8192)}
 GAP_QUICK = {"faces": 300, "pairs": (4,), "distances": (0.2,), "repeats": 2}
 GAPS = 0.0, 1e-4, 3e-4, 1e-3, 3e-3  # of the mesh's size
-PARTS = ("nearest", "gap")
+PARTS = ("nearest", "points", "gap")
 MESHES = ("cow", "rocker-arm", "stanford-bunny")
 NUT = ("factory-bolt-m20", "factory-nut-m20")
 
@@ -35,12 +42,19 @@ NUT = ("factory-bolt-m20", "factory-nut-m20")
 def run(device, quick=False, only=PARTS):
     """Yield a row a workload: times [ms] and what the searches took; of baselines, where they are at hand.
 
-    Of the part `gap` a row a number of pairs, distance of their centres, and gap: more is contacts over those without a
-    gap, ratio the time over that without one.
+    Of the part `points` a row a mesh: times a point [us], and points that Warp's query puts on the wrong side. Of the
+    part `gap` a row a number of pairs, distance of their centres, and gap: more is contacts over those without a gap,
+    ratio the time over that without one.
     """
     device = wp.get_device(device)
     if "nearest" in only:
         yield from measure_all(device, quick)
+    if "points" in only:
+        folder = ModelFolder(None)
+        for name in [name for name in POINT_MESHES if mesh_file(name)][: 1 if quick else None]:
+            yield measure_points(name, folder.load([name]), device, 300 if quick else POINTS)
+        torus = ab.Model.load(trimesh.creation.torus(1.0, 0.4, *((24, 12) if quick else (96, 48))))
+        yield measure_points("torus", torus, device, 300 if quick else POINTS)
     if "gap" in only:
         sizes = GAP_QUICK if quick else GAP_FULL
         knots = knot_model(sizes["faces"])
@@ -64,6 +78,48 @@ def measure_all(device, quick):
     for count in sizes["counts"]:
         matrices = shapes.pose_matrices(shapes.random_poses(shapes.longest_side(knots), count))
         yield measure(f"knot, {count} poses", [knots, knots], matrices, device, sizes["repeats"])
+
+
+@wp.kernel(module="unique")
+def ask_mesh_kernel(
+    mesh: wp.uint64, has_inside: int, points: wp.array(dtype=wp.vec3), distance_out: wp.array(dtype=float)
+):
+    i = wp.tid()
+    if has_inside != 0:
+        found = wp.mesh_query_point_sign_winding_number(mesh, points[i], 1.0e9)
+        foot = wp.mesh_eval_position(mesh, found.face, found.u, found.v)
+        distance_out[i] = found.sign * wp.length(points[i] - foot)
+    else:
+        near = wp.mesh_query_point_no_sign(mesh, points[i], 1.0e9)
+        distance_out[i] = wp.length(points[i] - wp.mesh_eval_position(mesh, near.face, near.u, near.v))
+
+
+def measure_points(name, model, device, count):
+    """Return the row of random points about one mesh."""
+    rng, (vertices, faces, _) = np.random.default_rng(0), model.mesh_at(model.lod_max)
+    low, size, signed = vertices.min(0), np.ptp(vertices, axis=0), model.winding.is_closed
+    points = low + size * rng.uniform(-0.1, 1.1, (count, 3))
+    near = vertices[rng.integers(0, len(vertices), count // 10)]
+    points[: len(near)] = near + rng.normal(size=near.shape) * 0.003 * size.max()
+    corners, rows = (wp.array(part, dtype=wp.vec3, device=device) for part in (vertices, points))
+    mesh = wp.Mesh(corners, wp.array(faces.ravel(), dtype=int, device=device), support_winding_number=signed)
+    found = wp.empty(count, dtype=float, device=device)
+    inputs = [mesh.id, int(signed), rows, found]
+    calls = {
+        "ours": lambda: ab.signed_distance(model, points, device=device.alias, signed=signed),
+        "peer": lambda: wp.launch(ask_mesh_kernel, count, inputs, device=device),
+    }
+    clock = time.thread_time if device.is_cpu else time.perf_counter
+    with one_core() if device.is_cpu else contextlib.nullcontext():
+        times = time_rounds({who: time_call(call, device, clock) for who, call in calls.items()}, 5)
+    truth = calls["ours"]()
+    row = {"device": device.name, "workload": name, "faces": model.face_count, "points": count, "signed": signed}
+    row |= {
+        "inside": np.count_nonzero(truth < 0),
+        "peer_wrong_sides": np.count_nonzero((truth < 0) != (found.numpy() < 0)),
+    }
+    row |= {f"{who}_us": 1e3 * float(np.median(times[who])) / count for who in calls}
+    return row | {"point_ratio": ratio_of(times["peer"], times["ours"])}
 
 
 def measure(name, models, matrices, device, repeats):

@@ -105,8 +105,9 @@ def check_baselines(rows):
 
 
 def check_distance(rows):
-    gaps = [row for row in rows if "gap" in row]
-    rows = [row for row in rows if "gap" not in row]
+    gaps, points = ([row for row in rows if name in row] for name in ("gap", "points"))
+    rows = [row for row in rows if "gap" not in row and "points" not in row]
+    assert points[-1]["workload"] == "torus" and 0 < points[-1]["inside"] < 300 and points[-1]["peer_wrong_sides"] <= 3
     assert [row["gap"] for row in gaps] == list(distance.GAPS)
     assert gaps[0]["more"] == 1 < gaps[-1]["more"] and all(row["ratio"] > 0 for row in gaps)
     assert rows[-1]["workload"] == "knot, 3 poses"
