@@ -3,27 +3,17 @@
 A playback owns its scene: one thread steps, queries and changes it.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
-from warp_abtree.app.render_data import Snapshot
+from warp_abtree.app.render_data import Snapshot, worlds_of
+from warp_abtree.app.scene_view import make_view
 from warp_abtree.app.toml.control import CONTROLLERS, LodControl
-from warp_abtree.interop.arrays import PoseInput
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame
 from warp_abtree.simulate.lod_request import LodSweep
 
 SWEEP_PERIOD = 8.0  # seconds from the finest LOD of a mesh to its base and back
 OWN_MODE, HOLD_MODE = "scene", "hold"  # LODs as the scene chooses them, and as they are
-
-
-class MeshView(NamedTuple):
-    """View of meshes: directions to the eye and upwards, and the world that is shown."""
-
-    eye: tuple[float, float, float] = (0.4, 0.35, 1.0)
-    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    world: int = 0
 
 
 class Playback:
@@ -134,17 +124,13 @@ class ScenePlayback(Playback):
         return self.loaded.motion.poses(self.time) if self._bodies is None else self._bodies.poses()
 
 
-NOWHERE = -2  # world of a place without an object
-
-
 class StillPlayback(Playback):
-    """A scene that stands at its poses, by default those of now; LODs begin where they are, and are swept if told."""
+    """A scene that stands at its poses; LODs begin where they are, and are swept if told."""
 
-    def __init__(self, scene: Scene, title: str, poses=None, sweep=None):
-        self._held = PoseInput(scene).poses.numpy().copy() if poses is None else np.array(poses, np.float64)
-        self._started, self._sweep = scene.lods, sweep
-        worlds = np.where(scene.present, scene.worlds, NOWHERE)
-        super().__init__(scene, title, worlds, 1 / 30, MeshView())
+    def __init__(self, scene: Scene, title: str, up="z", sweep=None):
+        view = make_view(up)
+        self._held, self._started, self._sweep = scene.poses, scene.lods, sweep
+        super().__init__(scene, title, worlds_of(scene), 1 / 30, view)
 
     def _begin(self):
         self.scene.set_lods(self._started)
@@ -169,7 +155,7 @@ class MeshPlayback(StillPlayback):
             start = _fraction_at(model, lods[mine[0]])
             self._sweeps.append(LodSweep([(model, mine)], start, min(start, _fraction_at(model, 0)), SWEEP_PERIOD))
         names = (m.name if m.parts == 1 else f"{m.name} ({m.parts} parts joined)" for m in models)
-        super().__init__(scene, " and ".join(dict.fromkeys(names)), poses, self._lods_at)
+        super().__init__(scene, " and ".join(dict.fromkeys(names)), "y", self._lods_at)
 
     def _lods_at(self, time):
         lods = self._started.astype(np.int64)

@@ -7,8 +7,10 @@ import numpy as np
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.cli.report import show_number
 from warp_abtree.query.result import Result
+from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame_row import FrameRow
 
+NOWHERE = -2  # world of a place without an object
 LABELS = 32  # distances that are told in numbers, at most
 
 
@@ -59,6 +61,19 @@ class RenderData:
         """Return (point, text) of the least distances, at the middles of their segments."""
         told = np.argsort(self.distance, kind="stable")[:LABELS]
         return [(self.nearest[i].mean(axis=0), show_number(self.distance[i], 4)) for i in told]
+
+
+def check_scene(scene):
+    """Raise TypeError for what is no `Scene`, ValueError for one without an object."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene is a {type(scene).__name__}, not a Scene")
+    if not scene.present.any():
+        raise ValueError("the scene has no object")
+
+
+def worlds_of(scene) -> np.ndarray:
+    """Return the world of every object, int (n,), NOWHERE at a place without an object."""
+    return np.where(scene.present, scene.worlds, NOWHERE)
 
 
 def objects_of_world(worlds, world: int) -> np.ndarray:

@@ -96,7 +96,10 @@ def intersecting_triangles(cache: MeshCache, snapshot, intersecting) -> dict[int
         owner, lod = split_key(key)
         rows = intersecting[rows]
         vertices, faces, face_ids = cache.mesh(owner, lod)
-        corners = place(snapshot.poses, rows[:, 0], vertices[faces[np.searchsorted(face_ids, rows[:, 1])]])
+        found_at = np.searchsorted(face_ids, rows[:, 1]).clip(max=len(face_ids) - 1)
+        if not np.array_equal(face_ids[found_at], rows[:, 1]):
+            raise ValueError("result: has faces that are not there at the objects' LODs")
+        corners = place(snapshot.poses, rows[:, 0], vertices[faces[found_at]])
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         step = (LIFT * cache.diagonals[owner] * normal / np.where(length > 0, length, 1.0))[:, None]
