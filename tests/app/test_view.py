@@ -1,6 +1,7 @@
 """Playbacks of scene files and meshes; geometry of a snapshot, panels, and what a viewer scene sends."""
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from warp_abtree.app.open_playback import open_playback, row_poses
 from warp_abtree.app.pictures import scenes
 from warp_abtree.app.pictures.render import camera_around
 from warp_abtree.app.playback import ScenePlayback
-from warp_abtree.app.render_data import Settings, compose, objects_of_world
+from warp_abtree.app.render_data import Settings, compose, make_legend, objects_of_world
 from warp_abtree.app.styles import COLOURS
 from warp_abtree.app.viewer import viewer_scene as stages
 from warp_abtree.app.viewer.viewer_scene import ViewerScene
@@ -55,6 +56,46 @@ def test_colours(playback):
     plain, by_lod = (geometry.object_colours(playback.scene, lods, by_lod=by_lod) for by_lod in (False, True))
     assert np.array_equal(plain[:2], np.round([255 * np.array(COLOURS[i][0]) for i in (0, 1)]))
     assert np.array_equal(by_lod[:2], np.round([255 * geometry.COARSE, 255 * geometry.FINE]))
+    part = np.linspace(0, 1, 50)[:, None, None]
+    ramp = (1 - part) * geometry.COARSE + part * geometry.FINE
+    assert np.linalg.norm(ramp - np.array([bright for _, bright in COLOURS]), axis=2).min() > 0.4
+
+
+def test_legend_tells_models_or_lods(playback):
+    cache = geometry.MeshCache(playback.scene)
+    data = compose(cache, playback.query("faces"), np.arange(3), Settings())
+    names = [model.name for model in playback.scene.models]
+    plain, by_lod = ([label for _, label in make_legend(playback.scene, [data], lods)] for lods in (False, True))
+    assert plain == [names[0], f"{names[0]}, intersecting", names[1], f"{names[1]}, intersecting"]
+    assert by_lod == ["coarsest LOD", "finest LOD", plain[1], plain[3]]
+
+
+@pytest.mark.parametrize(("i", "lod", "level"), [(0, None, 0), (1, None, 3), (1, 40, 2), (1, 40, 11)])
+def test_boxes_of_a_level_are_those_of_the_faces_below(playback, i, lod, level):
+    """Each box, in the world, is that of the posed vertices of the active faces in its half of halves."""
+    if lod is not None:
+        lods = playback.chosen.copy()
+        lods[i] = lod
+        playback.hold(lods)
+    snapshot, scene = playback.query("count"), playback.scene
+    model = scene.models[scene.object_model[i]]
+    edges = geometry.tree_boxes(scene, snapshot, i, level)
+    vertices, faces, ids = model.mesh_at(int(snapshot.lods[i]))
+    leaves, expected = scene.tree_state(i).face_node[ids].tolist(), []
+    above = np.array([leaf >> max(leaf.bit_length() - 1 - level, 0) for leaf in leaves])
+    for node in range(2**level, 2 ** (level + 1)):
+        below = above == node
+        if below.any():
+            corners = vertices[faces[below]].reshape(-1, 3)
+            expected.append((corners.min(axis=0), corners.max(axis=0)))
+    assert edges.shape == (12 * len(expected), 2, 3) and (len(expected) > 0) == (level < 11)
+    # Back to the model's frame, where edges lie along the axes.
+    turn = place(np.append([0, 0, 0], snapshot.poses[i, 3:]), np.eye(3)).T
+    for corners, (lower, upper) in zip((edges - snapshot.poses[i, :3]).reshape(-1, 24, 3) @ turn, expected):
+        assert np.allclose([corners.min(axis=0), corners.max(axis=0)], [lower, upper], atol=1e-6)
+        length = np.abs(corners[::2] - corners[1::2])
+        assert np.allclose(np.sort(length, axis=None)[-12:], np.sort(np.repeat(upper - lower, 4)), atol=1e-6)
+        assert np.allclose(length.sum(), 4 * (upper - lower).sum(), atol=1e-5)
 
 
 def test_bounds_hold_all_that_is_shown(playback):
@@ -81,7 +122,6 @@ def test_a_panel_holds_what_the_title_counts(playback):
     marked = (panel.colours[:, None] == bright).all(axis=2).any(axis=1)
     assert marked.sum() == 2 * len(met) and not marked[:faces].any()
     assert panel.title == f"3 objects, 1,216 faces\n{len(hits):,} intersecting face pairs"
-    assert len(scenes.make_legend(playback.scene, [data])) == 4
     alone = scenes.make_panel(cache, compose(cache, snapshot, np.array([0]), Settings()))
     assert len(alone.triangles) == 320 and alone.title == "1 object, 320 faces\n0 intersecting face pairs"
 
@@ -109,6 +149,9 @@ class Handle:
     def remove(self):
         self.__dict__["gone"] = True
 
+    def on_click(self, act):
+        self.__dict__["click"] = act
+
 
 class Api:
     """The scene of a server, without a server."""
@@ -126,12 +169,12 @@ class Api:
 
 
 class Show:
-    """A `ViewerScene` on an `Api`, and a clock that stands until it is told otherwise."""
+    """A `ViewerScene` on an `Api`, a clock that stands until it is told otherwise, and what was picked."""
 
     def __init__(self, playback):
-        self.playback, self.api, self.time = playback, Api(), 0.0
+        self.playback, self.api, self.time, self.picked = playback, Api(), 0.0, []
         self.cache = geometry.MeshCache(playback.scene)
-        self.viewer_scene = ViewerScene(self.api, self.cache, clock=lambda: self.time)
+        self.viewer_scene = ViewerScene(self.api, self.cache, clock=lambda: self.time, pick=self.picked.append)
         self.settings = Settings()
 
     def show(self, held=(), moved=()):
@@ -182,6 +225,18 @@ def test_settings_reach_the_viewer_scene(playback):
     assert show.settings.output == "faces" and ("/intersecting/0", "add_mesh_simple") in show.show()[1]
     show.settings.by_lod = True
     assert sorted(show.show()[1]) == [(f"/objects/{i}", "color") for i in range(3)]
+    show.settings.wireframe = True
+    assert sorted(show.show()[1]) == [(f"/objects/{i}", "wireframe") for i in range(3)]
+    show.api.handles["/objects/1"].click(None)
+    assert show.picked == [1]
+    show.settings.selected = 1
+    for level, count in ((0, 1), (2, 4)):
+        show.settings.tree_level = level
+        show.show()
+        assert show.api.handles["/boxes"].points.shape == (12 * count, 2, 3)
+    show.settings.selected = None
+    show.show()
+    assert not show.api.handles["/boxes"].visible
 
 
 def test_distances_are_drawn_between_nearest_points(playback):
@@ -231,6 +286,11 @@ def test_objects_of_a_model_and_lod_are_instances_of_one_mesh(playback, monkeypa
     assert np.allclose(handle.batched_wxyzs, [[1, 0, 0, 0], [1, 0, 0, 0]])
     assert np.allclose(show.api.handles[ring].batched_wxyzs, [[0.5**0.5, 0.5**0.5, 0, 0]])
     assert show.show()[1] == [] and not show.viewer_scene.waits
+    for instance in (1, 0):
+        handle.click(SimpleNamespace(instance_index=instance))
+    assert show.picked == [2, 0]
+    show.settings.wireframe = True
+    assert sorted(show.show()[1]) == [(ball, "wireframe"), (ring, "wireframe")]
     # A new mesh is sent out of sight; the object changes to it when the browser has had its time.
     _, heard = show.show({2: 100})
     assert ("/meshes/0/100", "add_batched_meshes_simple") in heard and show.viewer_scene.waits
@@ -241,6 +301,8 @@ def test_objects_of_a_model_and_lod_are_instances_of_one_mesh(playback, monkeypa
     show.time = 1.0
     show.show()
     assert coarse.visible and len(coarse.batched_positions) == 1 and len(handle.batched_positions) == 1
+    coarse.click(SimpleNamespace(instance_index=0))
+    assert show.picked[-1] == 2
     assert show.viewer_scene.waits and "/meshes/0/90" in show.api.handles
     show.time = 2.0
     show.show()

@@ -24,13 +24,14 @@ class Playback:
         view: eye and up, directions, and world, to begin with.
         camera: Called with a time [s], returns the `Camera` that LODs are for; or None.
         chosen: LOD of every object, int (n,).
+        mode: Of choosing LODs, one of `modes`.
     """
 
     def __init__(self, scene, title, worlds, time_step, view, camera=None, control=None):
         self.scene, self.title, self.worlds = scene, title, np.asarray(worlds)
         self.time_step, self.view = time_step, view
         self.camera, self.control = camera, control or LodControl()
-        self._mode, self._budget = OWN_MODE, None
+        self.mode, self._budget = OWN_MODE, None
         self.restart()
 
     def _begin(self) -> tuple:
@@ -46,7 +47,7 @@ class Playback:
         self._frame, self._bodies, self._own = self._begin()
         self.number, self.chosen, self._first = 0, self.scene.lods, self.scene.lods
         self._poses = self._poses_now()
-        self.choose(self._mode, self._budget)
+        self.choose(self.mode, self._budget)
 
     @property
     def time(self) -> float:
@@ -72,7 +73,12 @@ class Playback:
             name = self.control.controller if mode == OWN_MODE else mode
             inner = self.control.asked(name, budget_ms).make(self.scene, self.camera)
         self._frame.lods = (lambda _: self.chosen) if inner is None else inner
-        self._mode, self._budget = mode, budget_ms
+        self.mode, self._budget = mode, budget_ms
+
+    @property
+    def moves(self) -> bool:
+        """Whether steps change anything."""
+        return True
 
     def hold(self, lods):
         """Hold LODs of all objects, (n,), until others are chosen."""
@@ -128,12 +134,17 @@ class StillPlayback(Playback):
     """A scene that stands at its poses; LODs begin where they are, and are swept if told."""
 
     def __init__(self, scene: Scene, title: str, up="z", sweep=None):
-        view = make_view(up)
-        self._held, self._started, self._sweep = scene.poses, scene.lods, sweep
-        super().__init__(scene, title, worlds_of(scene), 1 / 30, view)
+        worlds, view = worlds_of(scene), make_view(up)
+        self._held, self.started, self._sweep = scene.poses, scene.lods, sweep
+        super().__init__(scene, title, worlds, 1 / 30, view)
+
+    @property
+    def moves(self):
+        """Whether LODs are swept, or chosen under a budget."""
+        return self.mode != HOLD_MODE and (self.mode != OWN_MODE or self._sweep is not None)
 
     def _begin(self):
-        self.scene.set_lods(self._started)
+        self.scene.set_lods(self.started)
         frame = Frame(self.scene, None, self._sweep, time_step=self.time_step)
         frame.warm_up()
         return frame, None, self._sweep
@@ -158,7 +169,7 @@ class MeshPlayback(StillPlayback):
         super().__init__(scene, " and ".join(dict.fromkeys(names)), "y", self._lods_at)
 
     def _lods_at(self, time):
-        lods = self._started.astype(np.int64)
+        lods = self.started.astype(np.int64)
         for sweep in self._sweeps:
             sweep.apply(sweep.fraction(time), lods)
         return lods

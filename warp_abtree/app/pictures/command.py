@@ -1,15 +1,15 @@
 """`warp-abtree picture`: a file of what `warp-abtree view` shows, still or moving, without a browser."""
 
-from contextlib import contextmanager
 from pathlib import Path
 
 from warp_abtree.app.cli.arguments import Parser, positive_count
 from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.app.open_playback import add_playback_arguments, open_playback
 from warp_abtree.app.pictures.render import import_pyvista
-from warp_abtree.app.pictures.scenes import SIZE, check_size, draw_frames, draw_snapshot, objects_to_draw
-from warp_abtree.app.render_data import Settings, Snapshot
+from warp_abtree.app.pictures.scenes import SIZE, SIZES, draw_frames, draw_snapshot
+from warp_abtree.app.render_data import Settings, Snapshot, objects_to_draw
 from warp_abtree.app.scene_view import make_view
+from warp_abtree.checks.arguments import whole_number
 
 SUMMARY = "draw a scene or meshes to a PNG file, or a scene's frames to a WebP or GIF file"
 EXAMPLES = (
@@ -48,8 +48,7 @@ def run_picture(options, progress):
     own = playback.view
     world = own.world if options.world is None else options.world
     up, eye = (own.up, options.eye or own.eye) if options.up is None else (options.up, options.eye)
-    with _of_options():
-        view, objects = make_view(up, eye, world), objects_to_draw(playback.worlds, world)
+    view, objects = make_view(up, eye, world), objects_to_draw(playback.worlds, world)
     settings = Settings(world, distances=options.distances)
     drawn = objects, options.out, playback.title, view, settings, options.size
     found = {"picture": str(options.out), "objects": len(objects)}
@@ -72,21 +71,11 @@ def _check(options):
         raise ValueError(f"--frame: {options.frame} is below 0")
     if options.frames is not None and options.frames <= options.every:
         raise ValueError(f"--frames: {options.frames}, every {options.every}, is less than two to draw")
-    with _of_options():
-        check_size(options.size)
+    whole_number(options.size, "--size", *SIZES)
     count = 0 if options.frames is None else -(-options.frames // options.every)
     if count * (3 * options.size**2 + GEOMETRY) > MEMORY_LIMIT:
         told = f"{count:,} pictures of {options.size} x {options.size} pixels take more than {MEMORY_LIMIT >> 30} GiB"
         raise ValueError(f"--frames: {told}; draw fewer by --every, or smaller ones by --size")
-
-
-@contextmanager
-def _of_options():
-    """Say that an error is about an option of the command line."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"--{error}") from None
 
 
 def run_frames(playback, frames: range, output, progress=None):

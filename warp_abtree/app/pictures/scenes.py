@@ -7,31 +7,14 @@ import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.cli.report import check_output
-from warp_abtree.app.pictures.render import (
-    Panel,
-    camera_of,
-    crop,
-    draw,
-    import_pyvista,
-    lay_out,
-    render,
-    write_animation,
-)
-from warp_abtree.app.render_data import (
-    RenderData,
-    Settings,
-    Snapshot,
-    check_scene,
-    compose,
-    objects_of_world,
-    worlds_of,
-)
+from warp_abtree.app.pictures.render import Panel, camera_of, crop, draw, lay_out, render, write_animation
+from warp_abtree.app.render_data import RenderData, Settings, Snapshot, compose, make_legend, objects_to_draw, worlds_of
 from warp_abtree.app.scene_view import make_view
 from warp_abtree.app.styles import COLOURS, NEAREST_COLOUR
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.scene.scene import Scene
 
-SIZE = 800  # pixels
+SIZE, SIZES = 800, (50, 8000)  # of a side [pixels]
 
 
 def make_panel(cache: geometry.MeshCache, data: RenderData, title: str | None = None) -> Panel:
@@ -51,36 +34,6 @@ def make_panel(cache: geometry.MeshCache, data: RenderData, title: str | None = 
     title += f"\n{data.pair_count:,} intersecting face pairs"
     lines = [(data.nearest, NEAREST_COLOUR)] if len(data.nearest) else []
     return Panel(title, np.concatenate(triangles), np.concatenate(colours), lines, data.labels())
-
-
-def make_legend(scene: Scene, panels: list[RenderData]) -> list:
-    """Return (colour, label) of the models that panels of one scene show; a model of one object has a given name."""
-    legend = []
-    shown = panels[0].shown
-    models, first, counts = np.unique(np.array(scene.object_model)[shown], return_index=True, return_counts=True)
-    for model, i, count in sorted(zip(models.tolist(), shown[first].tolist(), counts.tolist()), key=lambda row: row[1]):
-        plain, bright = COLOURS[model % len(COLOURS)]
-        name = scene.models[model].name
-        if count == 1 and scene.name(i) != f"{name} {i}":
-            name = scene.name(i)
-        legend.append((plain, name))
-        if any(model in data.intersecting for data in panels):
-            legend.append((bright, f"{name}, intersecting"))
-    return legend
-
-
-def check_size(size):
-    """Raise ValueError for a size of pictures that is out of range [pixels]."""
-    if not 50 <= size <= 8000:
-        raise ValueError(f"size: {size} is outside 50 .. 8000")
-
-
-def objects_to_draw(worlds, world: int) -> np.ndarray:
-    """Return the indices of the objects of a world; raise ValueError where there is none."""
-    objects = objects_of_world(worlds, world)
-    if not len(objects):
-        raise ValueError(f"world: no object is in world {world}")
-    return objects
 
 
 def picture(
@@ -104,12 +57,9 @@ def picture(
         ValueError: pyvista or Matplotlib is not installed, a bad option, or a result without faces on the host, or of
             another scene or other LODs.
     """
-    import_pyvista("picture")
-    check_scene(scene)
-    path = Path(path)
+    view, shown, path = make_view(up, eye, world), objects_to_draw(worlds_of(scene), world), Path(path)
     check_output(path, [".png"])
-    check_size(whole_number(size, "size", 1, 2**31 - 1))
-    view, shown = make_view(up, eye, world), objects_to_draw(worlds_of(scene), world)
+    whole_number(size, "size", *SIZES)
     if result is None:
         result = scene.intersect(output="faces")
     elif not isinstance(result.faces, np.ndarray):

@@ -10,7 +10,6 @@ import socket
 from warp_abtree.app.cli.arguments import Parser, milliseconds
 from warp_abtree.app.open_playback import add_playback_arguments, open_playback
 from warp_abtree.app.playback import Playback, StillPlayback
-from warp_abtree.app.render_data import check_scene
 from warp_abtree.app.viewer.guard import refuse_foreign
 from warp_abtree.scene.scene import Scene
 
@@ -119,11 +118,10 @@ def view(scene: Scene, title="scene", host=HOST, port=None, seconds=None, up="z"
         ValueError: viser is not installed, the scene has no object, up is no direction, or the address cannot be
             served at.
     """
-    check_scene(scene)
     import_viser()
     check_port(host, 0 if port is None else port)
-    lods = scene.lods
+    playback = StillPlayback(scene, title, up)
     try:
-        show(StillPlayback(scene, title, up), host, port, seconds=seconds)
+        show(playback, host, port, seconds=seconds)
     finally:
-        scene.set_lods(lods)
+        scene.set_lods(playback.started)
