@@ -70,7 +70,7 @@ def test_legend_tells_models_or_lods(playback):
     assert by_lod == ["coarsest LOD", "finest LOD", plain[1], plain[3]]
 
 
-@pytest.mark.parametrize(("i", "lod", "level"), [(0, None, 0), (1, None, 3), (1, 40, 2), (1, 40, 11)])
+@pytest.mark.parametrize(("i", "lod", "level"), [(0, None, 0), (1, None, 3), (1, 40, 2), (1, 40, 10), (1, 40, 11)])
 def test_boxes_of_a_level_are_those_of_the_faces_below(playback, i, lod, level):
     """Each box, in the world, is that of the posed vertices of the active faces in its half of halves."""
     if lod is not None:

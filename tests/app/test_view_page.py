@@ -157,7 +157,7 @@ def make_scene(device, count=0):
     """Return a playback of two balls that meet and a ring, in a still scene, and of many more balls, if asked."""
     (ball, ring), scene = make_models(), ab.Scene(device)
     scene.add(ball, name="<b>ball</b>")
-    scene.add(ball, (1.5, 0, 0, 0, 0, 0, 1), name="second")
+    scene.add(ball, (1.5, 0, 0, 0, 0, 0, 1), name="Second")
     scene.add(ring, (9, 0, 0, 0, 0, 0, 1))
     far = np.tile([0, 0, 0, 0, 0, 0, 1.0], (count, 1))
     far[:, 2] = 9 + 3 * np.arange(count)
@@ -174,11 +174,11 @@ def test_objects_are_found_selected_and_hidden(server, device):
     page = Page(server, make_scene(device))
     objects = page.objects
     ball, ring = (model.name for model in page.playback.scene.models)
-    assert list(boxes_of(objects)) == ["all 2", "<b>ball</b>", "second", f"{ring} 2"]
-    page._pick(0)
+    assert list(boxes_of(objects)) == ["all 2", "<b>ball</b>", "Second", f"{ring} 2"]
+    page.viewer_scene.pick(0)
     page.run(seconds=0.2)
     told, pairs = objects._told.content, page.snapshot.result.count[0]
-    assert f"<td>second ({pairs} face pairs)</td>" in told and pairs > 0 and f"<td>{ball}</td>" in told
+    assert f"<td>Second ({pairs} face pairs)</td>" in told and pairs > 0 and f"<td>{ball}</td>" in told
     assert objects._select.value == "<b>ball</b>" and len(page._data.boxes) == 12 and not page._level.disabled
     objects.select(1)
     page.advance()
@@ -192,12 +192,12 @@ def test_objects_are_found_selected_and_hidden(server, device):
     objects.show([1, 2], False)
     page.advance()
     assert not len(page._data.shown) and page._data.intersecting_count == 0
-    objects._filter.value = "SEC"
+    objects._filter.value = "sEC"
     objects._list()
-    assert list(boxes_of(objects)) == ["second"] and not boxes_of(objects)["second"].value
-    assert objects._select.options == ("none", "second")
+    assert list(boxes_of(objects)) == ["Second"] and not boxes_of(objects)["Second"].value
+    assert objects._select.options == ("none", "Second")
     objects.select(2)
-    assert objects._select.options == ("none", "second", f"{ring} 2")
+    assert objects._select.options == ("none", "Second", f"{ring} 2")
     objects.select(None)
     page.advance()
     assert objects._told.content == "" and not len(page._data.boxes) and page._level.disabled
@@ -232,15 +232,17 @@ def test_what_does_nothing_is_off(server, device):
 def test_a_model_of_one_lod_has_nothing_to_choose(server, device):
     scene = ab.Scene(device)
     scene.add(ab.Model.from_arrays(np.eye(3), [(0, 1, 2)]))
-    page = Page(server, StillPlayback(scene, "face", up="x"))
+    page = Page(server, StillPlayback(scene, "face", up=(1, 2, 3)))
     assert page._mode.disabled and page._all_lod.disabled
     # The grid lies across up, below the scene.
     turn = page._grid.wxyz[[1, 2, 3, 0]]
-    assert np.allclose(place((0, 0, 0, *turn), (0, 0, 1)), (1, 0, 0)) and page._grid.position[0] < 0
+    assert np.allclose(place((0, 0, 0, *turn), (0, 0, 1)), np.array([1, 2, 3]) / 14**0.5)
+    assert (np.array(page._grid.position) < 0).all()
 
 
 def test_frames_are_looked_at_again(server, device, monkeypatch):
     page = Page(server, make_playback(device))
+    page.advance()
     for _ in range(5):
         page._run_button("step")
         page.advance()

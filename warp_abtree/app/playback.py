@@ -77,7 +77,7 @@ class Playback:
 
     @property
     def moves(self) -> bool:
-        """Whether steps change anything."""
+        """Whether steps change anything, or did."""
         return True
 
     def hold(self, lods):
@@ -140,8 +140,8 @@ class StillPlayback(Playback):
 
     @property
     def moves(self):
-        """Whether LODs are swept, or chosen under a budget."""
-        return self.mode != HOLD_MODE and (self.mode != OWN_MODE or self._sweep is not None)
+        """Whether LODs are swept, or chosen under a budget, or were."""
+        return self.number > 0 or (self.mode != HOLD_MODE and (self.mode != OWN_MODE or self._sweep is not None))
 
     def _begin(self):
         self.scene.set_lods(self.started)

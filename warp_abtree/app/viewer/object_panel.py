@@ -1,6 +1,7 @@
 """Objects in the panel of the viewer: a list by model with visibility, a filter of names, and the object selected."""
 
 import contextlib
+from collections import Counter
 from html import escape
 
 import numpy as np
@@ -8,8 +9,8 @@ import numpy as np
 from warp_abtree.app.cli.report import show_number
 
 LISTED = 40  # objects that are listed one by one, and models; the filter finds the others
+MET = 8  # objects that the selected one meets are told, at most
 NONE = "none"
-LAST = 1e9  # place in the panel
 
 
 class ObjectPanel:
@@ -22,18 +23,18 @@ class ObjectPanel:
 
     def __init__(self, gui, scene, objects, on_change):
         """Build the folder of `objects` of a scene; `on_change(handle, act)` acts on a value that the user set."""
-        self._gui, self._scene, self._objects, self._on_change = gui, scene, objects, on_change
+        self._gui, self._scene, self._on_change = gui, scene, on_change
         self.visible, self.selected = np.ones(scene.object_count, bool), None
         self._models = np.array(scene.object_model)
         names = [scene.name(i) for i in objects.tolist()]
-        seen = dict(zip(*np.unique(names, return_counts=True)))
+        seen = Counter(names)
         self._names = {i: name if seen[name] == 1 else f"{name} #{i}" for i, name in zip(objects.tolist(), names)}
         self._indices = {name: i for i, name in self._names.items()}
         with gui.add_folder("Selected object"):
             self._select = gui.add_dropdown("name", [NONE], hint="or click on an object")
             on_change(self._select, lambda name: self.select(self._indices.get(name)))
             self._told = gui.add_html("")
-        self._parent = gui.add_folder("Objects", order=LAST)
+        self._parent = gui.add_folder("Objects", order=1e9)
         with self._parent:
             self._filter = gui.add_text("find", "", hint="a part of the name of an object or its model")
             on_change(self._filter, lambda _: self._list())
@@ -43,13 +44,11 @@ class ObjectPanel:
     def _list(self):
         """List the objects that the filter finds, by model, each with its visibility."""
         self._folder.remove()
-        self._boxes, asked = [], self._filter.value.strip().lower()
-        of_model = {k: [] for k in dict.fromkeys(self._models[self._objects].tolist())}
+        self._boxes, asked, of_model = [], self._filter.value.strip().lower(), {}
         for i, name in self._names.items():
             model = int(self._models[i])
             if asked in name.lower() or asked in self._scene.models[model].name.lower():
-                of_model[model].append(i)
-        of_model = {model: members for model, members in of_model.items() if members}
+                of_model.setdefault(model, []).append(i)
         room, count = LISTED, sum(map(len, of_model.values()))
         with self._parent:
             self._folder = self._gui.add_folder("visible")
@@ -65,8 +64,6 @@ class ObjectPanel:
                 room = max(room - len(members), 0)
             if count > LISTED or len(of_model) > LISTED:
                 self._gui.add_markdown(f"{LISTED} of {count:,} are listed one by one; **find** narrows the list.")
-            elif not count:
-                self._gui.add_markdown("No object has such a name.")
         self._offer()
 
     def _add_box(self, label, members):
@@ -100,11 +97,7 @@ class ObjectPanel:
             return
         model, lod, result = scene.models[self._models[i]], int(snapshot.lods[i]), snapshot.result
         rows = np.flatnonzero((result.pairs == i).any(axis=1) & result.any)
-        met = [
-            self._names[int(result.pairs[k].sum() - i)]
-            + ("" if result.count is None else f" ({result.count[k]:,} face pairs)")
-            for k in rows[:8]
-        ]
+        met = [f"{self._names[int(result.pairs[k].sum() - i)]} ({result.count[k]:,} face pairs)" for k in rows[:MET]]
         lines = [
             ("model", model.name),
             ("LOD", f"{lod:,} of {model.lod_max:,}"),

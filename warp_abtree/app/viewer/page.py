@@ -55,7 +55,7 @@ class Page:
     def __init__(self, server, playback):
         self.server, self.playback = server, playback
         self.cache = geometry.MeshCache(playback.scene)
-        self.viewer_scene = ViewerScene(server.scene, self.cache, pick=self._pick)
+        self.viewer_scene = ViewerScene(server.scene, self.cache, pick=lambda i: self._post(self.objects.select, i))
         self.settings = Settings(world=playback.view.world)
         self._eye, self._up = unit(playback.view.eye), unit(playback.view.up)
         if not (playback.worlds == self.settings.world).any() and not (playback.worlds == -1).any():
@@ -74,6 +74,7 @@ class Page:
         opened = self._open_coarser()
         self._build(opened)
         self.snapshot = playback.query(self.settings.output)
+        self._keep()
         self._place_camera()
 
     @property
@@ -172,12 +173,8 @@ class Page:
 
     def _look_back(self, number):
         """Show a frame that was run, as it was; nothing is queried again."""
-        self.playing, self._past = False, self._kept[min(int(number) - self._kept[0].number, len(self._kept) - 1)]
-        if self._past is self._kept[-1]:
-            self._past = None
-
-    def _pick(self, i):
-        self._post(self.objects.select, i)
+        kept = {snapshot.number: snapshot for snapshot in self._kept[:-1]}  # the last one is of now
+        self.playing, self._past = False, kept.get(int(number))
 
     def _choose(self):
         """Choose LODs in the mode of the panel; the slider is the budget of the modes that hold one."""
@@ -294,17 +291,15 @@ class Page:
         with self.server.atomic():
             self.viewer_scene.show(self._data)
 
-    @property
-    def _runs(self) -> bool:
-        return self.playback.moves or self.playback.number > 0
-
     def _show_text(self):
         """Show the numbers of the snapshot as a table."""
         data, snapshot, playback = self._data, self.snapshot, self.playback
         row, result = snapshot.row, snapshot.result
         self._show_controls()
         state = "playing" if self.playing else "paused" if self._past is None else "looking back"
-        rows = [("state", state), ("time", f"{snapshot.time:.3f} s, frame {snapshot.number:,}")] if self._runs else []
+        rows = (
+            [("state", state), ("time", f"{snapshot.time:.3f} s, frame {snapshot.number:,}")] if playback.moves else []
+        )
         rows += [
             ("objects shown", f"{len(data.shown):,} of {playback.scene.object_count:,}"),
             ("faces shown", f"{data.faces:,}"),
@@ -325,7 +320,7 @@ class Page:
         """Show the legend, the selected object and the slider of frames; turn off what does nothing now."""
         playback, kept = self.playback, self._kept
         self._buttons.options = ("pause" if self.playing else "play", "step", "restart")
-        self._buttons.visible, self._time.visible = self._runs, len(kept) > 1
+        self._buttons.visible, self._time.visible = playback.moves, len(kept) > 1
         self._time.min, self._time.max = kept[0].number, kept[-1].number
         self._time.value = self.snapshot.number
         self._budget.disabled = playback.mode not in BUDGET_MODES
