@@ -1,14 +1,15 @@
-"""Pictures of scenes made in Python, and directions upwards: of views, scene files and pictures."""
+"""Pictures of scenes made in Python, directions upwards of views and scene files, and boxes of AB-Trees."""
 
 import numpy as np
 import PIL.Image
 import pytest
 import trimesh
 from helpers import refused
-from helpers.viewer import BODIES, make_models, write_scene
+from helpers.viewer import BODIES, make_models, make_playback, place, write_scene
 
 import warp_abtree as ab
 from warp_abtree.app import load_scene, picture
+from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.pictures import scenes
 from warp_abtree.app.scene_view import make_view
 from warp_abtree.app.styles import COLOURS
@@ -119,3 +120,32 @@ def test_up_in_a_scene_file_is_against_gravity_unless_it_says(tmp_path, device, 
     assert np.allclose(loaded.picture.eye, make_view(up).eye)
     if camera is not None:
         assert np.argmax(loaded.camera(0.0).view[1] @ np.eye(3)) == np.argmax(camera)
+
+
+@pytest.mark.parametrize(("i", "lod", "level"), [(0, None, 0), (1, None, 3), (1, 40, 2), (1, 40, 10), (1, 40, 11)])
+def test_boxes_of_a_level_are_those_of_the_faces_below(device, i, lod, level):
+    """Each box, in the world, is that of the posed vertices of the active faces in its half of halves."""
+    playback = make_playback(device)
+    if lod is not None:
+        lods = playback.chosen.copy()
+        lods[i] = lod
+        playback.hold(lods)
+    snapshot, scene = playback.query("count"), playback.scene
+    model = scene.models[scene.object_model[i]]
+    edges = geometry.tree_boxes(scene, snapshot, i, level)
+    vertices, faces, ids = model.mesh_at(int(snapshot.lods[i]))
+    leaves, expected = scene.tree_state(i).face_node[ids].tolist(), []
+    above = np.array([leaf >> max(leaf.bit_length() - 1 - level, 0) for leaf in leaves])
+    for node in range(2**level, 2 ** (level + 1)):
+        below = above == node
+        if below.any():
+            corners = vertices[faces[below]].reshape(-1, 3)
+            expected.append((corners.min(axis=0), corners.max(axis=0)))
+    assert edges.shape == (12 * len(expected), 2, 3) and (len(expected) > 0) == (level < 11)
+    # Back to the model's frame, where edges lie along the axes.
+    turn = place(np.append([0, 0, 0], snapshot.poses[i, 3:]), np.eye(3)).T
+    for corners, (lower, upper) in zip((edges - snapshot.poses[i, :3]).reshape(-1, 24, 3) @ turn, expected):
+        assert np.allclose([corners.min(axis=0), corners.max(axis=0)], [lower, upper], atol=1e-6)
+        length = np.abs(corners[::2] - corners[1::2])
+        assert np.allclose(np.sort(length, axis=None)[-12:], np.sort(np.repeat(upper - lower, 4)), atol=1e-6)
+        assert np.allclose(length.sum(), 4 * (upper - lower).sum(), atol=1e-5)

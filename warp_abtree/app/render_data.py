@@ -83,11 +83,11 @@ def objects_of_world(worlds, world: int) -> np.ndarray:
     return np.flatnonzero((worlds == world) | (worlds == -1))
 
 
-def objects_to_draw(worlds, world: int) -> np.ndarray:
-    """Return the indices of the objects of a world; raise ValueError where there is none."""
+def objects_to_draw(worlds, world: int, where="") -> np.ndarray:
+    """Return the indices of the objects of a world; raise ValueError where there is none, with `where` it is said."""
     objects = objects_of_world(worlds, world)
     if not len(objects):
-        raise ValueError(f"world: no object is in world {world}")
+        raise ValueError(f"{where}world: no object is in world {world}")
     return objects
 
 
@@ -130,7 +130,7 @@ def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Sett
 def make_legend(scene: Scene, panels: list[RenderData], by_lod=False) -> list:
     """Return (colour, label) of what panels of one scene show; a model of one object goes by that one's given name."""
     shown = panels[0].shown
-    legend = [(geometry.COARSE, "coarsest LOD"), (geometry.FINE, "finest LOD")] if by_lod and len(shown) else []
+    legend: list = [(geometry.COARSE, "coarsest LOD"), (geometry.FINE, "finest LOD")] if by_lod and len(shown) else []
     models, first, counts = np.unique(np.array(scene.object_model)[shown], return_index=True, return_counts=True)
     for model, i, count in sorted(zip(models.tolist(), shown[first].tolist(), counts.tolist()), key=lambda row: row[1]):
         plain, bright = COLOURS[model % len(COLOURS)]

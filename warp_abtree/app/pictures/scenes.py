@@ -118,10 +118,7 @@ def draw_scene(loaded, path, time: float, poses=None, lods=None):
     scene, view = loaded.scene, loaded.picture
     time = time if view.time is None else view.time
     poses = loaded.motion.poses(time) if poses is None else poses
-    try:
-        shown = objects_to_draw(loaded.worlds, view.world)
-    except ValueError as error:
-        raise ValueError(f"{loaded.path}: picture.{error}") from None
+    shown = objects_to_draw(loaded.worlds, view.world, f"{loaded.path}: picture.")
     swept = [model for sweep in loaded.sweeps for model, indices in sweep.objects if np.isin(indices, shown).any()]
     cache, panels = geometry.MeshCache(scene), []
     before = scene.lods

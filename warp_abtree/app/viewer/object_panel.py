@@ -8,7 +8,7 @@ import numpy as np
 
 from warp_abtree.app.cli.report import show_number
 
-LISTED = 40  # objects that are listed one by one, and models; the filter finds the others
+LISTED_OBJECTS = 40  # objects that are listed one by one, and models; the filter finds the others
 MET = 8  # objects that the selected one meets are told, at most
 NONE = "none"
 
@@ -49,11 +49,11 @@ class ObjectPanel:
             model = int(self._models[i])
             if asked in name.lower() or asked in self._scene.models[model].name.lower():
                 of_model.setdefault(model, []).append(i)
-        room, count = LISTED, sum(map(len, of_model.values()))
+        room, count = LISTED_OBJECTS, sum(len(members) for members in of_model.values())
         with self._parent:
             self._folder = self._gui.add_folder("visible")
         with self._folder:
-            for model, members in list(of_model.items())[:LISTED]:
+            for model, members in list(of_model.items())[:LISTED_OBJECTS]:
                 name = self._scene.models[model].name
                 alone = len(members) == 1
                 with contextlib.nullcontext() if alone else self._gui.add_folder(name, expand_by_default=room > 0):
@@ -62,8 +62,10 @@ class ObjectPanel:
                     for i in members[:room]:
                         self._add_box(self._names[i], [i])
                 room = max(room - len(members), 0)
-            if count > LISTED or len(of_model) > LISTED:
-                self._gui.add_markdown(f"{LISTED} of {count:,} are listed one by one; **find** narrows the list.")
+            if count > LISTED_OBJECTS or len(of_model) > LISTED_OBJECTS:
+                self._gui.add_markdown(
+                    f"{LISTED_OBJECTS} of {count:,} are listed one by one; **find** narrows the list."
+                )
         self._offer()
 
     def _add_box(self, label, members):
@@ -86,7 +88,7 @@ class ObjectPanel:
         """Offer the objects that are listed for selection, and the one that is selected."""
         offered = {self._names[members[0]] for _, members in self._boxes if len(members) == 1}
         name = NONE if self.selected is None else self._names[self.selected]
-        self._select.options = [NONE, *sorted({*offered, name} - {NONE}, key=self._indices.get)]
+        self._select.options = [NONE, *sorted({*offered, name} - {NONE}, key=lambda name: self._indices[name])]
         self._select.value = name
 
     def tell(self, snapshot):
@@ -96,14 +98,14 @@ class ObjectPanel:
             self._told.content = ""
             return
         model, lod, result = scene.models[self._models[i]], int(snapshot.lods[i]), snapshot.result
-        rows = np.flatnonzero((result.pairs == i).any(axis=1) & result.any)
-        met = [f"{self._names[int(result.pairs[k].sum() - i)]} ({result.count[k]:,} face pairs)" for k in rows[:MET]]
+        meets = np.flatnonzero((result.pairs == i).any(axis=1) & result.any)
+        met = [f"{self._names[int(result.pairs[k].sum() - i)]} ({result.count[k]:,} face pairs)" for k in meets[:MET]]
         lines = [
             ("model", model.name),
             ("LOD", f"{lod:,} of {model.lod_max:,}"),
             ("faces", f"{model.progressive.active_count(lod):,} of {model.face_count:,}"),
             ("position", " ".join(show_number(x) for x in snapshot.poses[i, :3])),
-            (f"meets {len(rows):,}", ", ".join(met) + (", ..." if len(rows) > len(met) else "")),
+            (f"meets {len(meets):,}", ", ".join(met) + (", ..." if len(meets) > len(met) else "")),
         ]
         rows = "".join(f"<tr><td>{escape(key)}</td><td>{escape(value)}</td></tr>" for key, value in lines)
         self._told.content = f"<table style='font-size:0.85em;margin:0 1em'>{rows}</table>"
