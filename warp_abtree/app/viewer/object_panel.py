@@ -44,7 +44,8 @@ class ObjectPanel:
     def _list(self):
         """List the objects that the filter finds, by model, each with its visibility."""
         self._folder.remove()
-        self._boxes, asked, of_model = [], self._filter.value.strip().lower(), {}
+        self._boxes, asked = [], self._filter.value.strip().lower()
+        of_model: dict[int, list[int]] = {}
         for i, name in self._names.items():
             model = int(self._models[i])
             if asked in name.lower() or asked in self._scene.models[model].name.lower():
@@ -63,9 +64,7 @@ class ObjectPanel:
                         self._add_box(self._names[i], [i])
                 room = max(room - len(members), 0)
             if count > LISTED_OBJECTS or len(of_model) > LISTED_OBJECTS:
-                self._gui.add_markdown(
-                    f"{LISTED_OBJECTS} of {count:,} are listed one by one; **find** narrows the list."
-                )
+                self._gui.add_markdown(f"{LISTED_OBJECTS} of {count:,} are listed; **find** narrows the list.")
         self._offer()
 
     def _add_box(self, label, members):

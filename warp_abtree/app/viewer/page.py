@@ -297,9 +297,9 @@ class Page:
         row, result = snapshot.row, snapshot.result
         self._show_controls()
         state = "playing" if self.playing else "paused" if self._past is None else "looking back"
-        state = [("state", state), ("time", f"{snapshot.time:.3f} s, frame {snapshot.number:,}")]
+        first = [("state", state), ("time", f"{snapshot.time:.3f} s, frame {snapshot.number:,}")]
         rows = [
-            *(state if playback.moves else []),
+            *(first if playback.moves else []),
             ("objects shown", f"{len(data.shown):,} of {playback.scene.object_count:,}"),
             ("faces shown", f"{data.faces:,}"),
             ("pairs that meet", f"{int(np.count_nonzero(result.any)):,} of {len(result.pairs):,} near"),
