@@ -204,7 +204,7 @@ class Page:
         first.position, first.look_at, first.up = tuple(position), tuple(centre), tuple(self._up)
         first.near, first.far = radius / 500, 200 * radius
         scene, size = self.server.scene, 10.0 ** math.floor(math.log10(radius))
-        scene.world_axes.axes_length, scene.world_axes.axes_radius = size, size / 40
+        scene.world_axes.axes_length, scene.world_axes.axes_radius = size, size / 80
         turn = quaternions_of(Camera.look_at(self._up, np.zeros(3)).view.T[None])[0]  # z to up
         place = {"position": tuple(centre - radius * self._up), "wxyz": turn[[3, 0, 1, 2]]}
         sizes = {"cell_size": size / 10, "section_size": size, "fade_distance": 20 * radius}
