@@ -240,6 +240,21 @@ def test_a_model_of_one_lod_has_nothing_to_choose(server, device):
     assert page._grid.position @ (1, 2, 3) < 1
 
 
+@pytest.mark.parametrize("aspect", [0.4, 1.0, 2.5])
+def test_the_first_camera_sees_all_in_windows_of_any_shape(server, device, monkeypatch, aspect):
+    acts = []
+    monkeypatch.setattr(server, "on_client_connect", acts.append)
+    page = Page(server, make_scene(device))
+    client = SimpleNamespace(camera=SimpleNamespace(aspect=aspect))
+    acts[0](client)
+    camera, scene = ab.Camera.look_at(client.camera.position, client.camera.look_at), page.playback.scene
+    reach = np.tan(0.5 * server.initial_camera.fov)
+    for i, pose in enumerate(scene.poses):
+        vertices = scene.models[scene.object_model[i]].mesh_at(int(scene.lods[i]))[0]
+        x, y, z = camera.view @ (place(pose, vertices) - camera.eye).T
+        assert (z < 0).all() and (np.abs(x / z) < aspect * reach).all() and (np.abs(y / z) < reach).all()
+
+
 def test_frames_are_looked_at_again(server, device, monkeypatch):
     page = Page(server, make_playback(device))
     page.advance()
@@ -275,6 +290,8 @@ def test_many_faces_are_opened_coarser(server, device, monkeypatch):
     page._choose()
     page.advance()
     assert page._data.faces == 2 * 320 + 576 and np.array_equal(page.snapshot.lods, first)
+    playback.choose("predictive", 50.0)
+    assert Page(server, playback)._mode.value == "budget, predicted", "a budget chooses LODs itself"
 
 
 def test_a_scene_made_in_python_is_shown(device, capsys):

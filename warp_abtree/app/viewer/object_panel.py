@@ -9,7 +9,6 @@ import numpy as np
 from warp_abtree.app.cli.report import show_number
 
 LISTED_OBJECTS = 40  # objects that are listed one by one, and models; the filter finds the others
-MET = 8  # objects that the selected one meets are told, at most
 NONE = "none"
 
 
@@ -98,7 +97,7 @@ class ObjectPanel:
             return
         model, lod, result = scene.models[self._models[i]], int(snapshot.lods[i]), snapshot.result
         meets = np.flatnonzero((result.pairs == i).any(axis=1) & result.any)
-        met = [f"{self._names[int(result.pairs[k].sum() - i)]} ({result.count[k]:,} face pairs)" for k in meets[:MET]]
+        met = [f"{self._names[int(result.pairs[k].sum() - i)]} ({result.count[k]:,} face pairs)" for k in meets[:8]]
         lines = [
             ("model", model.name),
             ("LOD", f"{lod:,} of {model.lod_max:,}"),

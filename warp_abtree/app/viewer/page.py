@@ -71,8 +71,7 @@ class Page:
         server.gui.main_panel.dock_right()
         server.gui.set_panel_label(playback.title)
         self._light()
-        opened = self._open_coarser()
-        self._build(opened)
+        self._build(self._open_coarser())
         self.snapshot = playback.query(self.settings.output)
         self._keep()
         self._place_camera()
@@ -90,7 +89,7 @@ class Page:
         groups = geometry.group_objects(geometry.mesh_keys(playback.scene, lods), found).items()
         meshes = [(models[owner], lod, members) for key, members in groups for owner, lod in [geometry.split_key(key)]]
         total = sum(model.progressive.active_count(lod) * len(members) for model, lod, members in meshes)
-        if total <= FACE_BUDGET or playback.control.controller != "none":
+        if total <= FACE_BUDGET or (playback.mode, playback.control.controller) != (OWN_MODE, "none"):
             return ""
         for model, lod, members in meshes:
             fraction = model.progressive.active_count(lod) / model.face_count
@@ -203,6 +202,12 @@ class Page:
         position = centre + CAMERA_DISTANCE * radius * self._eye
         first.position, first.look_at, first.up = tuple(position), tuple(centre), tuple(self._up)
         first.near, first.far = radius / 500, 200 * radius
+
+        @self.server.on_client_connect
+        def _(client):  # a window that is higher than wide sees less
+            client.camera.position = centre + (position - centre) / min(client.camera.aspect, 1.0)
+            client.camera.look_at = centre
+
         scene, size = self.server.scene, 10.0 ** math.floor(math.log10(radius))
         scene.world_axes.axes_length, scene.world_axes.axes_radius = size, size / 80
         turn = quaternions_of(Camera.look_at(self._up, np.zeros(3)).view.T[None])[0]  # z to up
@@ -257,11 +262,9 @@ class Page:
         """Make the next snapshot, a frame on if it plays or steps, and send what changed."""
         moves = self.playing or self._steps > 0
         try:
+            self.snapshot = self._past or (self.playback.step if moves else self.playback.query)(self.settings.output)
             if self._past is None:
-                self.snapshot = (self.playback.step if moves else self.playback.query)(self.settings.output)
                 self._keep()
-            else:
-                self.snapshot = self._past
         except RuntimeError as error:
             self.playing = False
             self._tell("This frame failed", error)
