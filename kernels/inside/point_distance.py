@@ -12,6 +12,7 @@ from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.inside.nearest_face import NO_NEAREST, Solid, nearest_face, point_features, point_weights
 from warp_abtree.kernels.inside.parity import is_inside, load_posed_face
+from warp_abtree.kernels.intersect.box_tiles import spread_bits
 from warp_abtree.kernels.triangle.distance import largest_coordinate
 from warp_abtree.kernels.triangle.triangle_pair import PAIR_ROUNDING
 
@@ -21,16 +22,7 @@ wp.set_module_options(MODULE_OPTIONS)
 # Bits of a Morton code along each axis.
 CODE_BITS = wp.constant(10)
 # A little over 1: that squares of distances to boxes in float64 may be too large by.
-GROW = wp.constant(wp.float64(1.0 + 2.0**-30))
-
-
-@wp.func
-def spread_bits(x: wp.int32):
-    """Return the bits of a number of CODE_BITS, each followed by two zeros."""
-    y = (x | (x << 16)) & 0x30000FF
-    y = (y | (y << 8)) & 0x300F00F
-    y = (y | (y << 4)) & 0x30C30C3
-    return (y | (y << 2)) & 0x9249249
+BOX_GROW = wp.constant(wp.float64(1.0 + 2.0**-30))
 
 
 @wp.kernel(module_options=MODULE_OPTIONS, module="unique")
@@ -61,7 +53,7 @@ def solid_about(trees: Trees, pose: PairPose, centre: wp.vec3d, point: wp.vec3d)
     solid.centre = centre
     solid.slack = PAIR_ROUNDING * (size + largest_coordinate(centre) + largest_coordinate(point))
     solid.margin = wp.float64(2.0) * solid.slack
-    solid.grow = GROW
+    solid.grow = BOX_GROW
     return solid
 
 

@@ -1,6 +1,7 @@
 """Playbacks of scene files and meshes; geometry of a snapshot, panels, and what a viewer scene sends."""
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from warp_abtree.app.open_playback import open_playback, row_poses
 from warp_abtree.app.pictures import scenes
 from warp_abtree.app.pictures.render import camera_around
 from warp_abtree.app.playback import ScenePlayback
-from warp_abtree.app.render_data import Settings, compose, objects_of_world
+from warp_abtree.app.render_data import Settings, compose, make_legend, objects_of_world
 from warp_abtree.app.styles import COLOURS
 from warp_abtree.app.viewer import viewer_scene as stages
 from warp_abtree.app.viewer.viewer_scene import ViewerScene
@@ -55,6 +56,18 @@ def test_colours(playback):
     plain, by_lod = (geometry.object_colours(playback.scene, lods, by_lod=by_lod) for by_lod in (False, True))
     assert np.array_equal(plain[:2], np.round([255 * np.array(COLOURS[i][0]) for i in (0, 1)]))
     assert np.array_equal(by_lod[:2], np.round([255 * geometry.COARSE, 255 * geometry.FINE]))
+    part = np.linspace(0, 1, 50)[:, None, None]
+    ramp = (1 - part) * geometry.COARSE + part * geometry.FINE
+    assert np.linalg.norm(ramp - np.array([bright for _, bright in COLOURS]), axis=2).min() > 0.4
+
+
+def test_legend_tells_models_or_lods(playback):
+    cache = geometry.MeshCache(playback.scene)
+    data = compose(cache, playback.query("faces"), np.arange(3), Settings())
+    names = [model.name for model in playback.scene.models]
+    plain, by_lod = ([label for _, label in make_legend(playback.scene, [data], lods)] for lods in (False, True))
+    assert plain == [names[0], f"{names[0]}, intersecting", names[1], f"{names[1]}, intersecting"]
+    assert by_lod == ["coarsest LOD", "finest LOD", plain[1], plain[3]]
 
 
 def test_bounds_hold_all_that_is_shown(playback):
@@ -81,7 +94,6 @@ def test_a_panel_holds_what_the_title_counts(playback):
     marked = (panel.colours[:, None] == bright).all(axis=2).any(axis=1)
     assert marked.sum() == 2 * len(met) and not marked[:faces].any()
     assert panel.title == f"3 objects, 1,216 faces\n{len(hits):,} intersecting face pairs"
-    assert len(scenes.make_legend(playback.scene, [data])) == 4
     alone = scenes.make_panel(cache, compose(cache, snapshot, np.array([0]), Settings()))
     assert len(alone.triangles) == 320 and alone.title == "1 object, 320 faces\n0 intersecting face pairs"
 
@@ -109,6 +121,9 @@ class Handle:
     def remove(self):
         self.__dict__["gone"] = True
 
+    def on_click(self, act):
+        self.__dict__["click"] = act
+
 
 class Api:
     """The scene of a server, without a server."""
@@ -126,12 +141,12 @@ class Api:
 
 
 class Show:
-    """A `ViewerScene` on an `Api`, and a clock that stands until it is told otherwise."""
+    """A `ViewerScene` on an `Api`, a clock that stands until it is told otherwise, and what was picked."""
 
     def __init__(self, playback):
-        self.playback, self.api, self.time = playback, Api(), 0.0
+        self.playback, self.api, self.time, self.picked = playback, Api(), 0.0, []
         self.cache = geometry.MeshCache(playback.scene)
-        self.viewer_scene = ViewerScene(self.api, self.cache, clock=lambda: self.time)
+        self.viewer_scene = ViewerScene(self.api, self.cache, clock=lambda: self.time, pick=self.picked.append)
         self.settings = Settings()
 
     def show(self, held=(), moved=()):
@@ -182,6 +197,18 @@ def test_settings_reach_the_viewer_scene(playback):
     assert show.settings.output == "faces" and ("/intersecting/0", "add_mesh_simple") in show.show()[1]
     show.settings.by_lod = True
     assert sorted(show.show()[1]) == [(f"/objects/{i}", "color") for i in range(3)]
+    show.settings.wireframe = True
+    assert sorted(show.show()[1]) == [(f"/objects/{i}", "wireframe") for i in range(3)]
+    show.api.handles["/objects/1"].click(None)
+    assert show.picked == [1]
+    show.settings.selected = 1
+    for level, count in ((0, 1), (2, 4)):
+        show.settings.tree_level = level
+        show.show()
+        assert show.api.handles["/boxes"].points.shape == (12 * count, 2, 3)
+    show.settings.selected = None
+    show.show()
+    assert not show.api.handles["/boxes"].visible
 
 
 def test_distances_are_drawn_between_nearest_points(playback):
@@ -231,6 +258,11 @@ def test_objects_of_a_model_and_lod_are_instances_of_one_mesh(playback, monkeypa
     assert np.allclose(handle.batched_wxyzs, [[1, 0, 0, 0], [1, 0, 0, 0]])
     assert np.allclose(show.api.handles[ring].batched_wxyzs, [[0.5**0.5, 0.5**0.5, 0, 0]])
     assert show.show()[1] == [] and not show.viewer_scene.waits
+    for instance in (1, 0):
+        handle.click(SimpleNamespace(instance_index=instance))
+    assert show.picked == [2, 0]
+    show.settings.wireframe = True
+    assert sorted(show.show()[1]) == [(ball, "wireframe"), (ring, "wireframe")]
     # A new mesh is sent out of sight; the object changes to it when the browser has had its time.
     _, heard = show.show({2: 100})
     assert ("/meshes/0/100", "add_batched_meshes_simple") in heard and show.viewer_scene.waits
@@ -241,6 +273,8 @@ def test_objects_of_a_model_and_lod_are_instances_of_one_mesh(playback, monkeypa
     show.time = 1.0
     show.show()
     assert coarse.visible and len(coarse.batched_positions) == 1 and len(handle.batched_positions) == 1
+    coarse.click(SimpleNamespace(instance_index=0))
+    assert show.picked[-1] == 2
     assert show.viewer_scene.waits and "/meshes/0/90" in show.api.handles
     show.time = 2.0
     show.show()

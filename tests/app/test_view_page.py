@@ -12,7 +12,7 @@ import numpy as np
 import PIL.Image
 import pytest
 from helpers import refused
-from helpers.viewer import make_models, make_playback, run_command, write_scene
+from helpers.viewer import make_models, make_playback, place, run_command, write_scene
 
 import warp_abtree as ab
 
@@ -21,8 +21,11 @@ pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 from websockets import Headers
 
 from warp_abtree.app import view
+from warp_abtree.app.playback import StillPlayback
+from warp_abtree.app.viewer import page as module
 from warp_abtree.app.viewer.command import serve
 from warp_abtree.app.viewer.guard import is_refused, refuse_foreign
+from warp_abtree.app.viewer.object_panel import LISTED_OBJECTS
 from warp_abtree.app.viewer.page import Page
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -150,6 +153,147 @@ def test_what_people_do_reaches_the_scene(page):
     assert page.snapshot.row.budget_ms == 7.0 and "| budget | 7 ms |" in page._state.content
 
 
+def make_scene(device, count=0):
+    """Return a playback of two balls that meet and a ring, in a still scene, and of many more balls, if asked."""
+    (ball, ring), scene = make_models(), ab.Scene(device)
+    scene.add(ball, name="<b>ball</b>")
+    scene.add(ball, (1.5, 0, 0, 0, 0, 0, 1), name="Second")
+    scene.add(ring, (9, 0, 0, 0, 0, 0, 1))
+    far = np.tile([0, 0, 0, 0, 0, 0, 1.0], (count, 1))
+    far[:, 2] = 9 + 3 * np.arange(count)
+    scene.add_many([ball] * count, far, names=["far"] * count)
+    return StillPlayback(scene, "still")
+
+
+def boxes_of(objects) -> dict:
+    """Return the boxes of visibility of an `ObjectPanel` by their labels."""
+    return {box.label: box for box, _ in objects._boxes}
+
+
+def test_objects_are_found_selected_and_hidden(server, device):
+    page = Page(server, make_scene(device))
+    objects = page.objects
+    ball, ring = (model.name for model in page.playback.scene.models)
+    assert list(boxes_of(objects)) == ["all 2", "<b>ball</b>", "Second", f"{ring} 2"]
+    page.viewer_scene.pick(0)
+    page.run(seconds=0.2)
+    told, pairs = objects._told.content, page.snapshot.result.count[0]
+    assert f"<td>Second ({pairs} face pairs)</td>" in told and pairs > 0 and f"<td>{ball}</td>" in told
+    assert objects._select.value == "<b>ball</b>" and len(page._data.boxes) == 12 and not page._level.disabled
+    objects.select(1)
+    page.advance()
+    assert "&lt;b&gt;ball&lt;/b&gt; (" in objects._told.content and "<b>" not in objects._told.content
+    page._post(objects.show, [0, 1], False)
+    page.run(seconds=0.2)
+    assert page.shown.tolist() == page._data.shown.tolist() == [2]
+    assert [box.value for box in boxes_of(objects).values()] == [False, False, False, True]
+    objects.show([1], True)
+    assert [box.value for box in boxes_of(objects).values()] == [False, False, True, True]
+    objects.show([1, 2], False)
+    page.advance()
+    assert not len(page._data.shown) and page._data.intersecting_count == 0
+    objects._filter.value = "sEC"
+    objects._list()
+    assert list(boxes_of(objects)) == ["Second"] and not boxes_of(objects)["Second"].value
+    assert objects._select.options == ("none", "Second")
+    objects.select(2)
+    assert objects._select.options == ("none", "Second", f"{ring} 2")
+    objects.select(None)
+    page.advance()
+    assert objects._told.content == "" and not len(page._data.boxes) and page._level.disabled
+
+
+def test_ten_thousand_objects_are_listed_in_part(server, device):
+    page = Page(server, make_scene(device, 10_000))
+    boxes = boxes_of(page.objects)
+    assert len(boxes) == LISTED_OBJECTS + 1 and "all 10,002" in boxes and "far #5" in boxes
+    page.objects._filter.value = "#7777"
+    page.objects._list()
+    assert list(boxes_of(page.objects)) == ["far #7777"]
+
+
+def test_what_does_nothing_is_off(server, device):
+    page = Page(server, make_scene(device))
+    page.advance()
+    assert not page._buttons.visible and not page._time.visible and page._budget.disabled and not page._mode.disabled
+    assert "paused" not in page._state.content
+    page._mode.value = "budget, predicted"
+    page._choose()
+    page.advance()
+    assert page._buttons.visible and not page._budget.disabled
+    page._act((page._run_button, ("play",)))
+    page.advance()
+    assert page._buttons.options[0] == "pause"
+    page._act((page._run_button, ("pause",)))
+    page.advance()
+    assert page._buttons.options[0] == "play"
+
+
+def test_a_model_of_one_lod_has_nothing_to_choose(server, device):
+    scene = ab.Scene(device)
+    scene.add(ab.Model.from_arrays(np.eye(3), [(0, 1, 2)]))
+    page = Page(server, StillPlayback(scene, "face", up=(1, 2, 3)))
+    assert page._mode.disabled and page._all_lod.disabled
+    # The grid lies across up, below the scene.
+    turn = page._grid.wxyz[[1, 2, 3, 0]]
+    assert np.allclose(place((0, 0, 0, *turn), (0, 0, 1)), np.array([1, 2, 3]) / 14**0.5)
+    assert page._grid.position @ (1, 2, 3) < 1
+
+
+@pytest.mark.parametrize("aspect", [0.4, 1.0, 2.5])
+def test_the_first_camera_sees_all_in_windows_of_any_shape(server, device, monkeypatch, aspect):
+    acts = []
+    monkeypatch.setattr(server, "on_client_connect", acts.append)
+    page = Page(server, make_scene(device))
+    client = SimpleNamespace(camera=SimpleNamespace(aspect=aspect))
+    acts[0](client)
+    camera, scene = ab.Camera.look_at(client.camera.position, client.camera.look_at), page.playback.scene
+    reach = np.tan(0.5 * server.initial_camera.fov)
+    for i, pose in enumerate(scene.poses):
+        vertices = scene.models[scene.object_model[i]].mesh_at(int(scene.lods[i]))[0]
+        x, y, z = camera.view @ (place(pose, vertices) - camera.eye).T
+        assert (z < 0).all() and (np.abs(x / z) < aspect * reach).all() and (np.abs(y / z) < reach).all()
+
+
+def test_frames_are_looked_at_again(server, device, monkeypatch):
+    page = Page(server, make_playback(device))
+    page.advance()
+    for _ in range(5):
+        page._run_button("step")
+        page.advance()
+    shown, number = page.snapshot, page.playback.number
+    assert page._time.visible and (page._time.min, page._time.max, page._time.value) == (0, 4, 4)
+    monkeypatch.setattr(page.playback, "query", None)
+    page.settings.distances = True
+    page._look_back(1)
+    page.advance()
+    assert page.snapshot.number == 1 and not len(page._data.distance) and "looking back" in page._state.content
+    assert page.snapshot.lods[0] > shown.lods[0] and page.playback.number == number, "LODs fall as they sweep"
+    page._run_button("step")
+    page.advance()
+    assert page.snapshot.number == number + 1
+    monkeypatch.setattr(module, "KEPT_BYTES", 1)
+    page._run_button("step")
+    page.advance()
+    assert [kept.number for kept in page._kept] == [number + 1, number + 2]
+
+
+def test_many_faces_are_opened_coarser(server, device, monkeypatch):
+    monkeypatch.setattr(module, "FACE_BUDGET", 600)
+    playback = make_scene(device)
+    first = playback.scene.lods
+    page = Page(server, playback)
+    page.advance()
+    assert 550 < page._data.faces < 650 and (page.snapshot.lods < first).all()
+    assert page._mode.value == "hold as they are"
+    page._mode.value = "as the scene says"
+    page._choose()
+    page.advance()
+    assert page._data.faces == 2 * 320 + 576 and np.array_equal(page.snapshot.lods, first)
+    playback.choose("predictive", 50.0)
+    assert Page(server, playback)._mode.value == "budget, predicted", "a budget chooses LODs itself"
+
+
 def test_a_scene_made_in_python_is_shown(device, capsys):
     """At its poses and LODs, which it has at the end, too."""
     scene = ab.Scene(device)
@@ -218,6 +362,13 @@ def test_a_page_draws_and_its_controls_reach_the_scene():
             while count_green(tab) > 50:
                 tab.wait_for_timeout(300)
             assert page.snapshot.row.frame == 0 and not page.settings.intersecting
+            for name in ("play", "pause"):
+                tab.get_by_role("button", name=name).click()
+            tab.get_by_role("button", name="play").wait_for()
+            assert not page.playing and page.snapshot.number > 0
+            tab.mouse.click(250, 320)  # amid the objects
+            tab.get_by_text("position").wait_for()
+            assert page.objects.selected == 1
             assert not faults
             chromium.close()
         finally:

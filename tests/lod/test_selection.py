@@ -246,7 +246,9 @@ def test_camera_looks_where_it_is_told():
         ({"far": -1.0}, "far"),
         ({"far": math.inf}, "far"),
         ({"target": (0, 0, 1)}, "looks"),
-        ({"target": (0, 3, 1)}, "looks"),
+        ({"target": (0, 3, 1), "up": "-y"}, "looks"),
+        ({"target": (0, 3, 1), "up": "w"}, "up: 'w' is none of"),
+        ({"target": (0, 3, 1), "up": (0, 0, 0)}, "up: a direction of no length"),
     ],
 )
 def test_camera_refuses(wrong, what):
@@ -254,6 +256,20 @@ def test_camera_refuses(wrong, what):
         if "target" in wrong:
             Camera.look_at((0, 0, 1), **wrong)
         Camera(**{"eye": (0, 0, 1), "view": np.eye(3), **wrong})
+
+
+@pytest.mark.parametrize(
+    ("eye", "up", "row"),
+    [
+        ((5, 0, 0), None, (0, 0, 1)),
+        ((5, 0, 5), None, (-(0.5**0.5), 0, 0.5**0.5)),
+        ((0, 0, -5), None, (0, 1, 0)),  # along z
+        ((5, 0, 0), "-y", (0, -1, 0)),
+        ((0, 0, 5), (9, 0, 0), (1, 0, 0)),
+    ],
+)
+def test_up_is_upwards_on_the_screen(eye, up, row):
+    assert np.allclose(Camera.look_at(eye, (0, 0, 0), up).view[1], row)
 
 
 def test_view_measures_distance_motion_and_focus(device):

@@ -3,27 +3,17 @@
 A playback owns its scene: one thread steps, queries and changes it.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
-from warp_abtree.app.render_data import Snapshot
+from warp_abtree.app.render_data import Snapshot, worlds_of
+from warp_abtree.app.scene_view import make_view
 from warp_abtree.app.toml.control import CONTROLLERS, LodControl
-from warp_abtree.interop.arrays import PoseInput
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame
 from warp_abtree.simulate.lod_request import LodSweep
 
 SWEEP_PERIOD = 8.0  # seconds from the finest LOD of a mesh to its base and back
 OWN_MODE, HOLD_MODE = "scene", "hold"  # LODs as the scene chooses them, and as they are
-
-
-class MeshView(NamedTuple):
-    """View of meshes: directions to the eye and upwards, and the world that is shown."""
-
-    eye: tuple[float, float, float] = (0.4, 0.35, 1.0)
-    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    world: int = 0
 
 
 class Playback:
@@ -34,13 +24,14 @@ class Playback:
         view: eye and up, directions, and world, to begin with.
         camera: Called with a time [s], returns the `Camera` that LODs are for; or None.
         chosen: LOD of every object, int (n,).
+        mode: Of choosing LODs, one of `modes`.
     """
 
     def __init__(self, scene, title, worlds, time_step, view, camera=None, control=None):
         self.scene, self.title, self.worlds = scene, title, np.asarray(worlds)
         self.time_step, self.view = time_step, view
         self.camera, self.control = camera, control or LodControl()
-        self._mode, self._budget = OWN_MODE, None
+        self.mode, self._budget = OWN_MODE, None
         self.restart()
 
     def _begin(self) -> tuple:
@@ -56,7 +47,7 @@ class Playback:
         self._frame, self._bodies, self._own = self._begin()
         self.number, self.chosen, self._first = 0, self.scene.lods, self.scene.lods
         self._poses = self._poses_now()
-        self.choose(self._mode, self._budget)
+        self.choose(self.mode, self._budget)
 
     @property
     def time(self) -> float:
@@ -82,7 +73,12 @@ class Playback:
             name = self.control.controller if mode == OWN_MODE else mode
             inner = self.control.asked(name, budget_ms).make(self.scene, self.camera)
         self._frame.lods = (lambda _: self.chosen) if inner is None else inner
-        self._mode, self._budget = mode, budget_ms
+        self.mode, self._budget = mode, budget_ms
+
+    @property
+    def moves(self) -> bool:
+        """Whether steps change anything, or did."""
+        return True
 
     def hold(self, lods):
         """Hold LODs of all objects, (n,), until others are chosen."""
@@ -134,20 +130,21 @@ class ScenePlayback(Playback):
         return self.loaded.motion.poses(self.time) if self._bodies is None else self._bodies.poses()
 
 
-NOWHERE = -2  # world of a place without an object
-
-
 class StillPlayback(Playback):
-    """A scene that stands at its poses, by default those of now; LODs begin where they are, and are swept if told."""
+    """A scene that stands at its poses; LODs begin where they are, and are swept if told."""
 
-    def __init__(self, scene: Scene, title: str, poses=None, sweep=None):
-        self._held = PoseInput(scene).poses.numpy().copy() if poses is None else np.array(poses, np.float64)
-        self._started, self._sweep = scene.lods, sweep
-        worlds = np.where(scene.present, scene.worlds, NOWHERE)
-        super().__init__(scene, title, worlds, 1 / 30, MeshView())
+    def __init__(self, scene: Scene, title: str, up="z", sweep=None):
+        worlds, view = worlds_of(scene), make_view(up)
+        self._held, self.started, self._sweep = scene.poses, scene.lods, sweep
+        super().__init__(scene, title, worlds, 1 / 30, view)
+
+    @property
+    def moves(self):
+        """Whether LODs are swept, or chosen under a budget, or were."""
+        return self.number > 0 or (self.mode != HOLD_MODE and (self.mode != OWN_MODE or self._sweep is not None))
 
     def _begin(self):
-        self.scene.set_lods(self._started)
+        self.scene.set_lods(self.started)
         frame = Frame(self.scene, None, self._sweep, "count", self.time_step)
         frame.warm_up()
         return frame, None, self._sweep
@@ -169,10 +166,10 @@ class MeshPlayback(StillPlayback):
             start = _fraction_at(model, lods[mine[0]])
             self._sweeps.append(LodSweep([(model, mine)], start, min(start, _fraction_at(model, 0)), SWEEP_PERIOD))
         names = (m.name if m.parts == 1 else f"{m.name} ({m.parts} parts joined)" for m in models)
-        super().__init__(scene, " and ".join(dict.fromkeys(names)), poses, self._lods_at)
+        super().__init__(scene, " and ".join(dict.fromkeys(names)), "y", self._lods_at)
 
     def _lods_at(self, time):
-        lods = self._started.astype(np.int64)
+        lods = self.started.astype(np.int64)
         for sweep in self._sweeps:
             sweep.apply(sweep.fraction(time), lods)
         return lods

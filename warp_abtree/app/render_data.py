@@ -6,9 +6,12 @@ import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.cli.report import show_number
+from warp_abtree.app.styles import COLOURS
 from warp_abtree.query.result import Result
+from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame_row import FrameRow
 
+NOWHERE = -2  # world of a place without an object
 LABELS = 32  # distances that are told in numbers, at most
 
 
@@ -32,6 +35,9 @@ class Settings:
     intersecting: bool = True  # whether intersecting faces are coloured
     by_lod: bool = False  # whether colours tell LODs in the place of models
     distances: bool = False  # whether distances are drawn between objects that do not meet
+    wireframe: bool = False  # whether edges are drawn in the place of faces
+    selected: int | None = None  # object of whose AB-Tree boxes are drawn,
+    tree_level: int = 0  # those of the active nodes at a level; 0 is the root
 
     @property
     def output(self) -> str:
@@ -51,9 +57,11 @@ class RenderData:
     intersecting_count: int  # of faces, drawn or not
     pair_count: int  # of intersecting faces, drawn or not
     faces: int  # active faces of the shown objects together
-    error_mean: float  # mean certified error of the shown objects [units]
+    error_mean: float  # mean certified error of the shown objects [units]; NaN where that takes long
     nearest: np.ndarray  # nearest points of object pairs that are apart, float64 (k, 2, 3)
     distance: np.ndarray  # between them, float64 (k,)
+    boxes: np.ndarray  # edges of the boxes of the selected object's AB-Tree, float64 (k, 2, 3)
+    wireframe: bool  # whether edges are drawn in the place of faces
 
     def labels(self) -> list:
         """Return (point, text) of the least distances, at the middles of their segments."""
@@ -61,9 +69,33 @@ class RenderData:
         return [(self.nearest[i].mean(axis=0), show_number(self.distance[i], 4)) for i in told]
 
 
+def worlds_of(scene) -> np.ndarray:
+    """Return the world of every object, int (n,), NOWHERE at a place without one; refuse what is no scene or empty."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene is a {type(scene).__name__}, not a Scene")
+    if not scene.present.any():
+        raise ValueError("the scene has no object")
+    return np.where(scene.present, scene.worlds, NOWHERE)
+
+
 def objects_of_world(worlds, world: int) -> np.ndarray:
     """Return the indices of the objects of a world; those of world -1 are in every one."""
     return np.flatnonzero((worlds == world) | (worlds == -1))
+
+
+def objects_to_draw(worlds, world: int, where="") -> np.ndarray:
+    """Return the indices of the objects of a world; raise ValueError where there is none, with `where` it is said."""
+    objects = objects_of_world(worlds, world)
+    if not len(objects):
+        raise ValueError(f"{where}world: no object is in world {world}")
+    return objects
+
+
+def error_of(model, lod: int) -> float:
+    """Return the certified error of a LOD, NaN where certifying the model would take long."""
+    if lod == model.lod_max:
+        return 0.0
+    return model.error_at(lod) if model.face_count <= geometry.CERTIFIED_FACES else np.nan
 
 
 def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Settings) -> RenderData:
@@ -76,6 +108,7 @@ def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Sett
     distinct, repeats = np.unique(keys[shown], return_counts=True)
     meshes = [(*geometry.split_key(key), n) for key, n in zip(distinct.tolist(), repeats.tolist())]
     pairs = inside[result.pairs].all(axis=1) if len(result.pairs) else np.zeros(0, bool)
+    chosen, level = settings.selected, settings.tree_level
     nearest, distance = geometry.nearest_points(scene, shown, result) if settings.distances else geometry.NO_SEGMENTS
     return RenderData(
         poses=snapshot.poses,
@@ -86,7 +119,25 @@ def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Sett
         intersecting_count=len(intersecting),
         pair_count=int(result.count[pairs].sum()) if result.count is not None else 0,
         faces=sum(scene.models[model].progressive.active_count(lod) * n for model, lod, n in meshes),
-        error_mean=sum(scene.models[model].error_at(lod) * n for model, lod, n in meshes) / max(len(shown), 1),
+        error_mean=sum(error_of(scene.models[model], lod) * n for model, lod, n in meshes) / max(len(shown), 1),
         nearest=nearest,
         distance=distance,
+        boxes=geometry.NO_SEGMENTS[0] if chosen is None else geometry.tree_boxes(scene, snapshot, chosen, level),
+        wireframe=settings.wireframe,
     )
+
+
+def make_legend(scene: Scene, panels: list[RenderData], by_lod=False) -> list:
+    """Return (colour, label) of what panels of one scene show; a model of one object goes by that one's given name."""
+    shown = panels[0].shown
+    legend: list = [(geometry.COARSE, "coarsest LOD"), (geometry.FINE, "finest LOD")] if by_lod and len(shown) else []
+    models, first, counts = np.unique(np.array(scene.object_model)[shown], return_index=True, return_counts=True)
+    for model, i, count in sorted(zip(models.tolist(), shown[first].tolist(), counts.tolist()), key=lambda row: row[1]):
+        plain, bright = COLOURS[model % len(COLOURS)]
+        name = scene.models[model].name
+        if count == 1 and scene.name(i) != f"{name} {i}":
+            name = scene.name(i)
+        legend += [] if by_lod else [(plain, name)]
+        if any(model in data.intersecting for data in panels):
+            legend.append((bright, f"{name}, intersecting"))
+    return legend

@@ -11,9 +11,10 @@ from warp_abtree.checks.quaternions import matrices_of
 from warp_abtree.scene.scene import Scene
 
 LIFT = 1.5e-3  # of a model's diagonal: offset of intersecting faces from the mesh, to both sides
-COARSE, FINE = np.array((0.16, 0.24, 0.60)), np.array((1.0, 0.80, 0.20))
+COARSE, FINE = np.array((0.16, 0.24, 0.60)), np.array((0.94, 0.90, 0.84))  # LODs; far from all intersecting faces
 FEW_OBJECTS = 12  # all pairs of which have distances drawn
 NO_SEGMENTS = np.empty((0, 2, 3)), np.empty(0)
+CERTIFIED_FACES = 300_000  # of models whose errors are certified to be told, which takes seconds
 CACHED_FACES = 4_000_000  # that a cache of meshes keeps
 
 
@@ -96,7 +97,10 @@ def intersecting_triangles(cache: MeshCache, snapshot, intersecting) -> dict[int
         owner, lod = split_key(key)
         rows = intersecting[rows]
         vertices, faces, face_ids = cache.mesh(owner, lod)
-        corners = place(snapshot.poses, rows[:, 0], vertices[faces[np.searchsorted(face_ids, rows[:, 1])]])
+        found_at = np.searchsorted(face_ids, rows[:, 1]).clip(max=len(face_ids) - 1)
+        if not np.array_equal(face_ids[found_at], rows[:, 1]):
+            raise ValueError("result: has faces that are not there at the objects' LODs")
+        corners = place(snapshot.poses, rows[:, 0], vertices[faces[found_at]])
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         step = (LIFT * cache.diagonals[owner] * normal / np.where(length > 0, length, 1.0))[:, None]
@@ -119,6 +123,23 @@ def nearest_points(scene: Scene, shown, result) -> tuple[np.ndarray, np.ndarray]
     found = scene.intersect(pairs, output="distance")
     apart = found.distance > 0
     return found.points[apart], found.distance[apart]
+
+
+# Corners of a box, as bits for x, y and z, at the ends of its edges.
+EDGES = np.array([(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit])
+
+
+def tree_boxes(scene: Scene, snapshot, i: int, level: int) -> np.ndarray:
+    """Return the edges of the boxes of the active nodes at a level of object i's AB-Tree, in the world, (k, 2, 3).
+
+    Level 0 is the root. Waits for the device.
+    """
+    state = scene.tree_state(i)
+    nodes = np.arange(2**level, min(2 ** (level + 1), len(state.status)))
+    nodes = nodes[state.status[nodes] != 0]
+    upper = (np.arange(8)[:, None] >> np.arange(3) & 1).astype(bool)
+    corners = np.where(upper, state.upper[nodes, None], state.lower[nodes, None])
+    return place(snapshot.poses, np.full(len(nodes), i), corners)[:, EDGES].reshape(-1, 2, 3)
 
 
 def bounds(cache: MeshCache, snapshot, shown) -> tuple[np.ndarray, float]:

@@ -10,6 +10,20 @@ from warp_abtree.checks.arguments import finite_array, positive, whole_number
 from warp_abtree.checks.upload import Upload
 from warp_abtree.kernels.lod import view as kernels
 
+AXES = {f"{sign}{name}": f * axis for sign, f in (("", 1), ("-", -1)) for name, axis in zip("xyz", np.eye(3))}
+
+
+def as_direction(value, what: str = "up") -> np.ndarray:
+    """Return a direction as float64 (3,): of an axis, as "z" or "-y", or as it is; raise ValueError for another."""
+    if isinstance(value, str):
+        if value not in AXES:
+            raise ValueError(f"{what}: {value!r} is none of {', '.join(AXES)}, and no three numbers")
+        return AXES[value]
+    vector = finite_array(value, what, (3,))
+    if not vector.any():
+        raise ValueError(f"{what}: a direction of no length")
+    return vector
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -46,14 +60,22 @@ class Camera:
         positive(self.far, "far")
 
     @classmethod
-    def look_at(cls, eye, target, up=(0.0, 1.0, 0.0), **options) -> "Camera":
+    def look_at(cls, eye, target, up=None, **options) -> "Camera":
         """Return a camera at `eye` that looks at `target`, both in world units, with `up` upwards on its screen.
+
+        Args:
+            eye, target: Points [world units], (3,).
+            up: Axis, as "z" or "-y", or a direction, (3,); None is z, or y where the camera looks along z.
+            options: field_of_view, size and far of the camera.
 
         Raises:
             ValueError: `target` is `eye`, or `up` points along the view.
         """
         back = finite_array(eye, "eye", (3,)) - finite_array(target, "target", (3,))
-        right = np.cross(finite_array(up, "up", (3,)), back)
+        if up is None:
+            up = "z" if back[:2].any() else "y"
+        up = as_direction(up)
+        right = np.cross(up, back)
         length = np.linalg.norm(back), np.linalg.norm(right)
         if not length[0] > 0 or not length[1] > 1e-9 * length[0] * np.linalg.norm(up):
             raise ValueError("the camera looks at its own eye, or along up")

@@ -66,7 +66,7 @@ def make_parser() -> argparse.ArgumentParser:
         ("clash", clash_command, clash_command.clash),
         ("run", run_command, run_command.run),
         ("view", view_command, view_command.run_viewer),
-        ("picture", picture_command, picture_command.picture),
+        ("picture", picture_command, picture_command.run_picture),
         ("sweep", sweep_command, sweep_command.run_sweep),
     ):
         command(name, function, module.SUMMARY, module.EXAMPLES, module.add_arguments)

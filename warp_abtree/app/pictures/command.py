@@ -2,15 +2,14 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from warp_abtree.app.cli.arguments import Parser, positive_count
 from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.app.open_playback import add_playback_arguments, open_playback
 from warp_abtree.app.pictures.render import import_pyvista
-from warp_abtree.app.pictures.scenes import SIZE, draw_frames, draw_snapshot
-from warp_abtree.app.render_data import Settings, Snapshot, objects_of_world
-from warp_abtree.app.toml.objects import unit
+from warp_abtree.app.pictures.scenes import SIZE, SIZES, draw_frames, draw_snapshot
+from warp_abtree.app.render_data import Settings, Snapshot, objects_to_draw
+from warp_abtree.app.scene_view import make_view
+from warp_abtree.checks.arguments import whole_number
 
 SUMMARY = "draw a scene or meshes to a PNG file, or a scene's frames to a WebP or GIF file"
 EXAMPLES = (
@@ -40,22 +39,18 @@ def add_arguments(sub: Parser):
     sub.add_argument("--size", type=positive_count, default=SIZE, metavar="PX", help=f"pixels along a side ({SIZE})")
 
 
-def picture(options, progress):
-    """Draw a picture."""
+def run_picture(options, progress):
+    """Draw what the command line names."""
     import_pyvista("picture")
     _check(options)
     named = {"objects": options.objects, "poses": options.pose, "lod": options.lod}
     playback = open_playback(options.source, options.device, progress, **named)
-    eye = unit(playback.view.eye) if options.eye is None else options.eye
-    up = unit(playback.view.up) if options.up is None else options.up
-    if not np.isfinite([*eye, *up]).all() or not np.linalg.norm(np.cross(eye, up)) > 1e-6:
-        raise ValueError("--eye: eye and up are not finite, of no length, or point the same way")
-    world = playback.view.world if options.world is None else options.world
-    objects = objects_of_world(playback.worlds, world)
-    if not len(objects):
-        raise ValueError(f"--world: no object is in world {world}")
+    own = playback.view
+    world = own.world if options.world is None else options.world
+    up, eye = (own.up, options.eye or own.eye) if options.up is None else (options.up, options.eye)
+    view, objects = make_view(up, eye, world), objects_to_draw(playback.worlds, world)
     settings = Settings(world, distances=options.distances)
-    drawn = objects, options.out, playback.title, (eye, up), settings, options.size
+    drawn = objects, options.out, playback.title, view, settings, options.size
     found = {"picture": str(options.out), "objects": len(objects)}
     if options.frames is None:
         snapshot = go_to(playback, options.frame, settings.output, progress)
@@ -76,8 +71,7 @@ def _check(options):
         raise ValueError(f"--frame: {options.frame} is below 0")
     if options.frames is not None and options.frames <= options.every:
         raise ValueError(f"--frames: {options.frames}, every {options.every}, is less than two to draw")
-    if not 50 <= options.size <= 8000:
-        raise ValueError(f"--size: {options.size} is outside 50 .. 8000")
+    whole_number(options.size, "--size", *SIZES)
     count = 0 if options.frames is None else -(-options.frames // options.every)
     if count * (3 * options.size**2 + GEOMETRY) > MEMORY_LIMIT:
         told = f"{count:,} pictures of {options.size} x {options.size} pixels take more than {MEMORY_LIMIT >> 30} GiB"

@@ -116,7 +116,7 @@ def lay_out(images: list, titles: list[str], title: str, legend) -> np.ndarray:
     from matplotlib.figure import Figure
 
     rows, columns = images[0].shape[:2]
-    gap, head, panel_head = 16, 44, 50
+    gap, head, panel_head = 16, 44 if title else 0, 50
     width = len(images) * columns + (len(images) + 1) * gap
     # Pairs of entries, plain and intersecting, stay side by side.
     across = max(1, min(len(legend) // 2, width // (2 * LEGEND_WIDTH)))

@@ -1,17 +1,29 @@
 """Pictures of scenes: objects at their LODs and poses, intersecting faces coloured."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
+from warp_abtree.app.cli.report import check_output
 from warp_abtree.app.pictures.render import Panel, camera_of, crop, draw, lay_out, render, write_animation
-from warp_abtree.app.playback import MeshView
-from warp_abtree.app.render_data import LABELS, RenderData, Settings, Snapshot, compose, objects_of_world
+from warp_abtree.app.render_data import (
+    LABELS,
+    RenderData,
+    Settings,
+    Snapshot,
+    compose,
+    make_legend,
+    objects_to_draw,
+    worlds_of,
+)
+from warp_abtree.app.scene_view import make_view
 from warp_abtree.app.styles import COLOURS, NEAREST_COLOUR
+from warp_abtree.checks.arguments import whole_number
 from warp_abtree.scene.scene import Scene
 
-SIZE = 800  # pixels
+SIZE, SIZES = 800, (50, 8000)  # of a side [pixels]
 
 
 def make_panel(cache: geometry.MeshCache, data: RenderData, title: str | None = None) -> Panel:
@@ -33,24 +45,46 @@ def make_panel(cache: geometry.MeshCache, data: RenderData, title: str | None = 
     return Panel(title, np.concatenate(triangles), np.concatenate(colours), lines, data.labels())
 
 
-def make_legend(scene: Scene, panels: list[RenderData]) -> list:
-    """Return (colour, label) of the models that panels of one scene show."""
-    legend = []
-    for model in dict.fromkeys(np.array(scene.object_model)[panels[0].shown].tolist()):
-        plain, bright = COLOURS[model % len(COLOURS)]
-        name = scene.models[model].name
-        legend.append((plain, name))
-        if any(model in data.intersecting for data in panels):
-            legend.append((bright, f"{name}, intersecting"))
-    return legend
+def picture(
+    scene: Scene, path, *, result=None, up="z", eye=None, world=0, distances=False, size=SIZE, title=""
+) -> Path:
+    """Draw a scene as it stands to a PNG file, intersecting faces coloured; return its path. Waits for the device.
+
+    Args:
+        scene: `Scene` with objects.
+        path: PNG file to write, whole or not at all.
+        result: `Result` of the scene as it stands, whose faces are coloured, as of some pairs; None asks for all.
+        up: Axis that points upwards, as "z" or "-y", or a direction, (3,).
+        eye: Direction to the eye, as up; None is from the front, a little from the right and from above.
+        world: World to draw; objects of world -1 are in every one.
+        distances: Whether distances are drawn between objects: of few all, of more those whose boxes overlap.
+        size: Pixels along a side.
+        title: Above the picture.
+
+    Raises:
+        TypeError: scene is no Scene.
+        ValueError: pyvista or Matplotlib is not installed, a bad option, or a result without faces on the host, or of
+            another scene or other LODs.
+    """
+    view, shown, path = make_view(up, eye, world), objects_to_draw(worlds_of(scene), world), Path(path)
+    check_output(path, [".png"])
+    whole_number(size, "size", *SIZES)
+    if result is None:
+        result = scene.intersect(output="faces")
+    elif not isinstance(result.faces, np.ndarray):
+        raise ValueError("result: no faces on the host; ask for output 'faces' or 'contacts'")
+    elif result.pairs.max(initial=-1) >= scene.object_count:
+        raise ValueError(f"result: names an object that is none of the scene's {scene.object_count:,}")
+    snapshot = Snapshot(0, 0.0, scene.poses, scene.lods, result, None)
+    draw_snapshot(scene, snapshot, shown, path, title, view, Settings(world, distances=distances), size)
+    return path
 
 
 def draw_snapshot(scene: Scene, snapshot: Snapshot, shown, path, title: str, view, settings: Settings, size: int):
-    """Draw the shown objects of a snapshot to a PNG file; `view` is the directions to the eye and upwards."""
+    """Draw the shown objects of a snapshot to a PNG file, as a `SceneView` sees them."""
     cache = geometry.MeshCache(scene)
     data = compose(cache, snapshot, shown, settings)
-    (eye, up), legend = view, make_legend(scene, [data])
-    draw([make_panel(cache, data)], path, title, legend, eye, up, size)
+    draw([make_panel(cache, data)], path, title, make_legend(scene, [data]), view.eye, view.up, size)
 
 
 def draw_frames(scene: Scene, snapshots, shown, path, title: str, view, settings: Settings, size: int):
@@ -61,7 +95,7 @@ def draw_frames(scene: Scene, snapshots, shown, path, title: str, view, settings
         panels.append(make_panel(cache, data))
         seen.append(replace(data, colours=data.colours[:0], poses=data.poses[:0]))
         times.append(snapshot.time)
-    camera, legend = camera_of(panels, *view), make_legend(scene, seen)
+    camera, legend = camera_of(panels, view.eye, view.up), make_legend(scene, seen)
     images = crop([render(panel, camera, size) for panel in panels])
     drawn = [lay_out([image], [panel.title], title, legend) for image, panel in zip(images, panels)]
     write_animation(drawn, path, round(1000 * (times[-1] - times[0]) / (len(times) - 1)))
@@ -69,7 +103,7 @@ def draw_frames(scene: Scene, snapshots, shown, path, title: str, view, settings
 
 def draw_clashes(scene: Scene, result, path, title: str):
     """Draw a scene to a PNG file, with the faces, curves and names of a result's pairs that have contacts."""
-    view, cache = MeshView(), geometry.MeshCache(scene)
+    view, cache = make_view("y"), geometry.MeshCache(scene)
     snapshot = Snapshot(0, 0.0, scene.poses, scene.lods, result, None)
     panel = make_panel(cache, compose(cache, snapshot, np.arange(scene.object_count), Settings()))
     panel.lines.append((np.stack([result.contacts["p0"], result.contacts["p1"]], 1), NEAREST_COLOUR))
@@ -104,9 +138,7 @@ def draw_scene(loaded, path, time: float, poses=None, lods=None):
     scene, view = loaded.scene, loaded.picture
     time = time if view.time is None else view.time
     poses = loaded.motion.poses(time) if poses is None else poses
-    shown = objects_of_world(loaded.worlds, view.world)
-    if len(shown) == 0:
-        raise ValueError(f"{loaded.path}: picture.world: no object is in world {view.world}")
+    shown = objects_to_draw(loaded.worlds, view.world, f"{loaded.path}: picture.")
     swept = [model for sweep in loaded.sweeps for model, indices in sweep.objects if np.isin(indices, shown).any()]
     cache, panels = geometry.MeshCache(scene), []
     before = scene.lods

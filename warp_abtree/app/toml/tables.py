@@ -20,6 +20,7 @@ import numpy as np
 from msgspec import Meta, Struct, defstruct, field
 from msgspec.structs import replace
 
+from warp_abtree.app.scene_view import make_view
 from warp_abtree.app.toml.objects import OBJECT_LIMIT, unit
 from warp_abtree.lod.view import Camera
 from warp_abtree.scene.objects import ALL_BITS
@@ -288,7 +289,7 @@ class CameraTable(Table):
 
     eye: Vector | None = None
     target: Vector | None = None
-    up: Vector = (0.0, 1.0, 0.0)
+    up: Vector | None = None  # against gravity by default, without it y
     field_of_view: Annotated[float, Meta(ge=1, le=170)] = 60.0  # vertical
     size: tuple[Annotated[int, Meta(ge=1, le=2**20)], Annotated[int, Meta(ge=1, le=2**20)]] = (1920, 1080)  # pixels
     far: Positive = 100.0  # how far one sees: D of the paper
@@ -307,7 +308,6 @@ class CameraTable(Table):
         for i, time in enumerate(times):
             if i and not time > times[i - 1]:
                 raise ValueError(f"keys[{i}].time: {time} is not after the one before, {times[i - 1]}")
-            self.look(self.keys[i].eye, self.keys[i].target)
 
     def __call__(self, time: float) -> Camera:
         times = [key.time for key in self.keys]
@@ -336,17 +336,11 @@ class DynamicsTable(Table):
 class PictureTable(Table):
     """[picture]: for `run --picture`, and where `view` and `picture` look from."""
 
-    eye: Vector = (0.4, 0.35, 1.0)  # direction from the scene to the eye
-    up: Vector = (0.0, 1.0, 0.0)
+    eye: Vector | None = None  # direction from the scene to the eye; by default from the front, right and above
+    up: Vector | None = None  # that of the camera by default, else against gravity, without it y
     world: Annotated[int, Meta(ge=0, le=2**31 - 1)] = 0  # the world drawn
     time: float | None = None  # the last frame by default, which rigid bodies always show
     lods: Fraction | Panels | None = None  # of swept objects, a panel each; by default both ends
-
-    def __post_init__(self):
-        check_direction("eye", self.eye)
-        check_direction("up", self.up)
-        if not np.linalg.norm(np.cross(unit(self.eye), unit(self.up))) > 1e-6:
-            raise ValueError("up: points along eye")
 
 
 class SceneTable(Table, kw_only=True):
@@ -364,6 +358,24 @@ class SceneTable(Table, kw_only=True):
     def __post_init__(self):
         if self.dynamics is not None and self.picture.time is not None:
             raise ValueError("picture.time: rigid bodies are drawn as the last frame leaves them")
+        self._set_up_directions()
+
+    def _set_up_directions(self):
+        """Give camera and picture the directions that the file does not."""
+        gravity = np.array(ORIGIN if self.dynamics is None else self.dynamics.gravity)
+        up, camera, picture = tuple(-gravity) if gravity.any() else (0.0, 1.0, 0.0), self.camera, self.picture
+        if camera is not None:
+            up = camera.up = camera.up or up
+            try:
+                for key in camera.keys:
+                    camera.look(key.eye, key.target)
+            except ValueError as error:
+                raise ValueError(f"camera: {error}") from None
+        try:
+            view = make_view(picture.up or up, picture.eye)
+        except ValueError as error:
+            raise ValueError(f"picture.{error}") from None
+        picture.eye, picture.up = tuple(view.eye), tuple(view.up)
 
 
 # Keys whose values are names, and the names.

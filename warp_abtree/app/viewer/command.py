@@ -101,7 +101,7 @@ def show(playback: Playback, host=HOST, port=None, as_json=False, seconds=None):
             page.run(seconds)
 
 
-def view(scene: Scene, title="scene", host=HOST, port=None, seconds=None):
+def view(scene: Scene, title="scene", host=HOST, port=None, seconds=None, up="z"):
     """Show a scene in the browser, as it stands: print the address, and serve until Ctrl-C.
 
     The page sets LODs, which are those of before at the end; poses stay. Waits for the device.
@@ -111,18 +111,17 @@ def view(scene: Scene, title="scene", host=HOST, port=None, seconds=None):
         title: What the page is called.
         host, port: Where to serve: this machine alone at 8080, or the next port that is free.
         seconds: How long [s]; None is until Ctrl-C.
+        up: Axis that points upwards, as "z" or "-y", or a direction, (3,).
 
     Raises:
         TypeError: scene is no Scene.
-        ValueError: viser is not installed, the scene has no object, or the address cannot be served at.
+        ValueError: viser is not installed, the scene has no object, up is no direction, or the address cannot be
+            served at.
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene is a {type(scene).__name__}, not a Scene")
     import_viser()
     check_port(host, 0 if port is None else port)
-    lods = scene.lods
+    playback = StillPlayback(scene, title, up)
     try:
-        show(StillPlayback(scene, title), host, port, seconds=seconds)
+        show(playback, host, port, seconds=seconds)
     finally:
-        if scene.object_count:
-            scene.set_lods(lods)
+        scene.set_lods(playback.started)

@@ -8,7 +8,7 @@ import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.render_data import RenderData
-from warp_abtree.app.styles import COLOURS, NEAREST_COLOUR, to_bytes
+from warp_abtree.app.styles import BOX_COLOUR, COLOURS, NEAREST_COLOUR, to_bytes
 
 SINGLE_LIMIT = 24  # objects up to which each has its own mesh; with more, those of a model and LOD are instances of one
 READY_SECONDS = 0.25  # that a browser takes to draw instances of a new mesh
@@ -19,11 +19,12 @@ PLAIN = {"flat_shading": True, "side": "double", "cast_shadow": False, "receive_
 
 @dataclass(eq=False)
 class _Node:
-    """A node of the browser's scene: its handle, the arrays sent last, and when it was added [s]."""
+    """A node of the browser's scene: its handle, what was sent last, when it was added [s], and its objects."""
 
     handle: Any  # of viser
     sent: dict
     since: float = 0.0
+    members: Any = ()  # objects that are its instances
 
 
 class ViewerScene:
@@ -33,12 +34,13 @@ class ViewerScene:
     only after the browser has had the time to prepare that; otherwise it would vanish for a few frames.
 
     Attributes:
+        pick: Called with the object that a user clicks, in a thread of the server.
         sent: Bytes of arrays sent so far.
         waits: Whether objects still show an earlier LOD, so that `show` should be called again soon.
     """
 
-    def __init__(self, api, cache, clock=time.monotonic):
-        self.api, self.cache, self.clock = api, cache, clock
+    def __init__(self, api, cache, clock=time.monotonic, pick=lambda i: None):
+        self.api, self.cache, self.clock, self.pick = api, cache, clock, pick
         self.sent, self.waits = 0, False
         count = cache.scene.object_count
         self._single: dict[int, _Node] = {}
@@ -56,7 +58,9 @@ class ViewerScene:
         for owner in range(len(self.cache.scene.models)):
             corners = data.intersecting.get(owner, ())
             self._show_triangles(f"/intersecting/{owner}", corners, COLOURS[owner % len(COLOURS)][1])
-        self._show_distances(data)
+        self._show_segments("/distances", data.nearest, NEAREST_COLOUR)
+        self._show_segments("/boxes", data.boxes, BOX_COLOUR)
+        self._show_labels(data)
 
     def _update(self, node: _Node, **arrays):
         """Assign the arrays that differ from those sent last."""
@@ -93,13 +97,16 @@ class ViewerScene:
             node = self._single.get(i)
             if node is None:
                 arrays = {**self._mesh_arrays(key), **place}
-                handle = self.api.add_mesh_simple(f"/objects/{i}", **arrays, color=colour, **PLAIN)
-                self._single[i] = self._added(handle, arrays, key=key, color=colour)
+                look = {"color": colour, "wireframe": data.wireframe}
+                handle = self.api.add_mesh_simple(f"/objects/{i}", **arrays, **look, **PLAIN)
+                handle.on_click(lambda _, i=i: self.pick(i))
+                self._single[i] = self._added(handle, arrays, key=key, **look)
                 continue
             if node.sent["key"] != key:
                 self._update(node, **self._mesh_arrays(key))
                 node.sent["key"] = key
             self._set(node, "color", colour)
+            self._set(node, "wireframe", data.wireframe)
             self._update(node, **place)
             self._set(node, "visible", True)
 
@@ -121,10 +128,12 @@ class ViewerScene:
             }
             node = self._meshes.pop(key, None)
             if node is None:
-                node = self._add_instances(key, members, arrays, visible=key in groups)
+                node = self._add_instances(key, arrays, visible=key in groups, wireframe=data.wireframe)
             elif key in groups:
+                self._set(node, "wireframe", data.wireframe)
                 self._update(node, **arrays)
                 self._set(node, "visible", True)
+            node.members = members
             self._meshes[key] = node  # the last used stand last
         hidden = [key for key in self._meshes if key not in groups and key not in coming]
         for key in hidden[: max(len(hidden) - HIDDEN_MESHES, 0)]:
@@ -151,11 +160,13 @@ class ViewerScene:
         self._next[asks] = wanted[asks]
         self.waits = bool(late.any())
 
-    def _add_instances(self, key, members, arrays, visible) -> _Node:
+    def _add_instances(self, key, arrays, **look) -> _Node:
         arrays = {**self._mesh_arrays(key), **arrays}
         name = "/meshes/{}/{}".format(*geometry.split_key(key))
-        handle = self.api.add_batched_meshes_simple(name, **arrays, lod="off", visible=visible, **PLAIN)
-        return self._added(handle, arrays, visible)
+        handle = self.api.add_batched_meshes_simple(name, **arrays, lod="off", **look, **PLAIN)
+        node = self._added(handle, arrays, **look)
+        handle.on_click(lambda event: self.pick(int(node.members[event.instance_index])))
+        return node
 
     def _show_triangles(self, name, corners, colour):
         """Show triangles as a node of their own; without any hide it."""
@@ -170,26 +181,23 @@ class ViewerScene:
             self._update(node, **arrays)
             self._set(node, "visible", bool(arrays))
 
-    def _show_distances(self, data):
-        """Show the segments between nearest points, and the least distances in numbers at their middles."""
-        node, count = self._layers.get("/distances"), len(data.distance)
+    def _show_segments(self, name, ends, colour):
+        """Show segments (k, 2, 3) as a node of their own; without any hide it."""
+        node, count = self._layers.get(name), len(ends)
+        if node is not None and count and count != len(node.sent["points"]):
+            node.handle.remove()  # points and colours go together
+            node = None
         if node is None and count:
-            colour = np.array(to_bytes(NEAREST_COLOUR), np.uint8)
-            arrays = {"points": data.nearest.astype(np.float32), "colors": np.tile(colour, (count, 2, 1))}
-            handle = self.api.add_line_segments("/distances", **arrays, **LINE)
-            self._layers["/distances"] = self._added(handle, arrays)
+            colour = np.array(to_bytes(colour), np.uint8)
+            arrays = {"points": ends.astype(np.float32), "colors": np.tile(colour, (count, 2, 1))}
+            handle = self.api.add_line_segments(name, **arrays, **LINE)
+            self._layers[name] = self._added(handle, arrays)
         elif node is not None:
-            if count and count != len(node.sent["points"]):
-                # Points and colours go together.
-                node.handle.remove()
-                del self._layers["/distances"]
-                self._show_distances(data)
-                return
-            self._update(node, **({"points": data.nearest.astype(np.float32)} if count else {}))
+            self._update(node, **({"points": ends.astype(np.float32)} if count else {}))
             self._set(node, "visible", count > 0)
-        self._show_labels(data)
 
     def _show_labels(self, data):
+        """Show the least distances in numbers at the middles of their segments."""
         told = data.labels()
         for k, (point, text) in enumerate(told):
             place = {"position": point}
