@@ -43,7 +43,7 @@ def main(path="assembly.glb", table="clashes.csv", png="clash_report.png", devic
     depths = dict(zip(map(tuple, pairs.tolist()), zip(way.depth, way.direction)))
     for (first, second), (depth, direction) in sorted(depths.items(), key=lambda item: -item[1][0])[:5]:
         print(f"move {scene.name(second)} by {depth:.3f} mm along {np.round(direction, 2)} out of {scene.name(first)}")
-    picture(scene, png)
+    picture(scene, png, result=scene.intersect(pairs, "faces"))
     return scene, clashes, way
 
 

@@ -49,7 +49,7 @@ def main(count=20_000, png="grasps.png", device=None):
     width = np.where(free, closed[1] - closed[0] - THICK, np.nan)
     print(f"{free.sum():,} of {len(poses):,} poses are free; the fingers hold {1e3 * np.nanmin(width):.1f} mm and more")
     best, scene = np.nanargmin(width), ab.Scene(device)
-    scene.add_many([mug, palm], [np.eye(4), poses[best]])
+    scene.add_many([mug, palm], [np.eye(4), poses[best]], names=["mug", "palm"])
     for way in closed:
         scene.add(finger, poses[best] @ trimesh.transformations.translation_matrix((way[best], 0, 0)))
     picture(scene, png)

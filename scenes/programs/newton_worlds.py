@@ -51,7 +51,7 @@ def main(worlds=256, seconds=2.0, png="newton_worlds.png", device=None):
     for k, ring in enumerate(rings[:4]):
         for part, pose in zip(shown, ((0, 0, -0.1, 0, 0, 0, 1), (0, 0, 0.74, 0, 0, 0, 1), ring)):
             scene.add(part, np.asarray(pose, float) + (3.2 * k, 0, 0, 0, 0, 0, 0))
-    picture(scene, png)
+    picture(scene, png, result=scene.intersect(np.empty((0, 2), int), "faces"))  # no faces coloured
     return rings, around
 
 

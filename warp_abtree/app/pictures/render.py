@@ -119,7 +119,8 @@ def lay_out(images: list, titles: list[str], title: str, legend) -> np.ndarray:
     gap, head, panel_head = 16, 44 if title else 0, 50
     width = len(images) * columns + (len(images) + 1) * gap
     # Pairs of entries, plain and intersecting, stay side by side.
-    across = max(1, min(len(legend) // 2, width // (2 * LEGEND_WIDTH)))
+    entry = max([LEGEND_WIDTH, *(50 + 7 * len(label) for _, label in legend)])
+    across = max(1, min(len(legend) // 2, width // (2 * entry)))
     foot = 40 + 20 * (-(-len(legend) // (2 * across)) - 1)
     height = head + panel_head + rows + foot
     dpi = 100
