@@ -11,24 +11,28 @@ import sys
 import threading
 import time
 import urllib.request
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
+from conftest import slow_rows
 from helpers.samples import SHUTTLE_SCENE
-from helpers.viewer import write_scene
+from helpers.viewer import run_command, write_scene
 
 import warp_abtree as ab
 from warp_abtree.app.cli import main as cli
 from warp_abtree.app.cli import progress as progress_module
+from warp_abtree.checks import signals
 from warp_abtree.jobs import RayPool
 from warp_abtree.jobs import ray_pool as cluster
 
 ROOT = Path(__file__).resolve().parents[2]
 INTERRUPT, TERMINATE = signal.SIGINT, signal.SIGTERM
 BOTH = (INTERRUPT, TERMINATE)
+# A process takes 2 to 3 s of a core, most of it to import: quick tests start one of each kind.
 # What a command of this process runs until the signal comes, which a line on stdout asks for.
 HANG = """
 import sys, time
@@ -88,7 +92,7 @@ SLOW = [
     ("words", "place", "before", "number", "status", "left"),
     [
         (BUILD, "np.savez_compressed", ignore, INTERRUPT, 130, []),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW),
+        *slow_rows(*SLOW),
     ],
 )
 def test_a_signal_stops_a_command(files, words, place, before, number, status, left):
@@ -152,7 +156,7 @@ sys.exit(cli.main())
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize("name", ["rows.csv", "rows.json"])
+@pytest.mark.parametrize("name", ["rows.csv", *slow_rows(["rows.json"])])
 def test_an_interrupted_run_keeps_its_rows(files, name):
     status, _, errors = run_process(f"run scene.toml --record {name} --device cpu", STOP_IN_FRAME)
     assert (status, errors) == (130, "warp-abtree: interrupted\n")
@@ -193,11 +197,13 @@ def test_the_version_needs_no_warp():
     ("module", "number", "delay", "told"),
     [
         ("warp", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
-        ("scipy.sparse", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
-        ("trimesh", TERMINATE, 0.01, (143, "warp-abtree: terminated\n")),
-        ("trimesh.exchange.gltf", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
         ("pxr", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),  # of a command that runs already
-        ("pxr", TERMINATE, 60.0, (143, "warp-abtree: terminated\n")),  # and that ends before it comes again
+        *slow_rows(
+            ("scipy.sparse", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
+            ("trimesh", TERMINATE, 0.01, (143, "warp-abtree: terminated\n")),
+            ("trimesh.exchange.gltf", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
+            ("pxr", TERMINATE, 60.0, (143, "warp-abtree: terminated\n")),  # and that ends before it comes again
+        ),
     ],
 )
 def test_a_signal_during_imports_is_not_caught(module, number, delay, told):
@@ -206,15 +212,57 @@ def test_a_signal_during_imports_is_not_caught(module, number, delay, told):
     assert (status, errors) == told
 
 
-# A signal comes while a finaliser runs, of which Python drops what is raised, or at the end of the process.
-STOP_IN_DEL = """
-import atexit, os, signal, sys
+SIGNALLED = "import os, time\ndef __del__():\n    os.kill(os.getpid(), number)\n    time.sleep(0.05)\n__del__()"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("file", ["model.py", signals.IMPORTS])
+def test_a_signal_waits_for_imports_and_finalisers(monkeypatch, file):
+    """It comes again once they have ended; and goes to handlers that others set before that."""
+    code = compile(SIGNALLED.replace("__del__", "load" if file == signals.IMPORTS else "__del__"), file, "exec")
+    before, seen, others = [signal.getsignal(number) for number in BOTH], [], []
+    try:
+        for number in BOTH:
+            for delay in (0.01, 60.0):
+                monkeypatch.setattr(signals, "DELAY", delay)
+                signal.signal(number, signals.not_swallowed(lambda number, frame: seen.append(number)))
+                exec(code, {"number": number})
+                assert not seen and not others
+                if delay > 1:
+                    signals.handle_signals(*2 * [lambda number, frame: others.append(number)])
+                end = time.monotonic() + 20
+                while not seen and not others and time.monotonic() < end:
+                    time.sleep(0.01)
+                assert (seen, others) == (([], [number]) if delay > 1 else ([number], []))
+                seen.clear()
+                others.clear()
+    finally:
+        for number, handler in zip(BOTH, before):
+            signal.signal(number, handler)
+
+
+THING = """
+import atexit, os, sys
 from warp_abtree.__main__ import main
-from warp_abtree.app.cli import model_commands
 
 class Thing:
     def __del__(self, kill=os.kill, number=os.getpid()):
         kill(number, 2)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_a_signal_after_the_last_code_changes_nothing():
+    """Done is done."""
+    told = run_process("--version", THING + "sys.kept = Thing()\nsys.exit(main())")
+    assert told == (0, f"warp-abtree {ab.__version__}\n", "")
+
+
+# A signal comes while a finaliser runs, of which Python drops what is raised, or at the end of the process.
+STOP_IN_DEL = (
+    THING
+    + """
+from warp_abtree.app.cli import model_commands
 
 def describe(mesh, described=model_commands.describe_mesh):
     thing = Thing()
@@ -230,15 +278,15 @@ def print_last(*result, print_result=model_commands.print_result):
 PLACE
 sys.exit(main())
 """
+)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize(
     ("place", "told"),
     [
-        ("model_commands.describe_mesh = describe", (130, False, "warp-abtree: interrupted\n")),
         ("model_commands.print_result = print_last", (130, True, "warp-abtree: interrupted\n")),
-        ("sys.kept = Thing()", (0, True, "")),  # after the last Python code: done is done
+        *slow_rows(("model_commands.describe_mesh = describe", (130, False, "warp-abtree: interrupted\n"))),
     ],
 )
 def test_a_signal_while_something_ends_is_not_dropped(files, place, told):
@@ -246,22 +294,24 @@ def test_a_signal_while_something_ends_is_not_dropped(files, place, told):
     assert (status, "diagonal" in shown, errors) == told
 
 
+@pytest.mark.slow
 def test_a_warning_is_one_line(files):
     Path("lines.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nl 1 2\n")
     status, _, errors = run_process("info lines.obj --device cpu")
     assert (status, errors) == (0, "warp-abtree: lines.obj: left out lines\n")
 
 
-def test_a_kernel_cache_that_cannot_be_written_names_its_variable(files):
+def test_a_kernel_cache_that_cannot_be_written_names_its_variable(files, capsys):
     status, _, errors = run_process("info ball.obj --device cpu", WARP_CACHE_PATH=str(files / "ball.obj" / "cache"))
     assert status == 2 and errors.count("\n") == 1 and "ball.obj/cache" in errors
     assert errors.endswith("(Warp's kernel cache; WARP_CACHE_PATH names a folder that can be written)\n")
-    status, _, errors = run_process("info gone.obj --device cpu")
-    assert status == 2 and "WARP_CACHE_PATH" not in errors
+    _, (error,) = run_command(capsys, "info", "gone.obj", "--device", "cpu", status=2)
+    assert "WARP_CACHE_PATH" not in error
 
 
 def test_a_caller_keeps_its_signals(files, capsys, monkeypatch):
     """Of a command that is called, and of a program's that runs in another thread than the main one."""
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
     before = [signal.getsignal(number) for number in BOTH]
     words = ["info", "ball.obj", "--device", "cpu"]
     assert cli.main(words) == 0
@@ -272,6 +322,7 @@ def test_a_caller_keeps_its_signals(files, capsys, monkeypatch):
     thread.join()
     assert status == [0] and not capsys.readouterr().err
     assert [signal.getsignal(number) for number in BOTH] == before
+    assert warnings.formatwarning(UserWarning("a\nb"), UserWarning, "some.py", 7) == "warp-abtree: a\nb\n"
 
 
 def test_ray_leaves_a_program_its_handler(monkeypatch):
