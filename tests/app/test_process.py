@@ -1,4 +1,4 @@
-"""The process of a command: progress on stderr, and SIGINT and SIGTERM, which leave no half-written file."""
+"""The process of a command: errors on stderr, and SIGINT and SIGTERM, which leave no half-written file."""
 
 import csv
 import io
@@ -12,6 +12,7 @@ import threading
 import time
 import urllib.request
 import warnings
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,7 +25,6 @@ from helpers.viewer import run_command, write_scene
 
 import warp_abtree as ab
 from warp_abtree.app.cli import main as cli
-from warp_abtree.app.cli import progress as progress_module
 from warp_abtree.checks import signals
 from warp_abtree.jobs import RayPool
 from warp_abtree.jobs import ray_pool as cluster
@@ -213,29 +213,34 @@ SIGNALLED = "import os, time\ndef __del__():\n    os.kill(os.getpid(), number)\n
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("number", BOTH)
 @pytest.mark.parametrize("file", ["model.py", signals.IMPORTS])
-def test_a_signal_waits_for_imports_and_finalisers(monkeypatch, file):
+def test_a_signal_waits_for_imports_and_finalisers(monkeypatch, file, number):
     """It comes again once they have ended; and goes to handlers that others set before that."""
+    seen, timers, before = [], [], [signal.getsignal(each) for each in BOTH]
+
+    def note(kind):
+        return lambda number, frame: seen.append((kind, number))
+
+    def timer(_, send, arguments):
+        return SimpleNamespace(start=lambda: timers.append(partial(send, *arguments)))
+
+    monkeypatch.setattr(signals.threading, "Timer", timer)
     code = compile(SIGNALLED.replace("__del__", "load" if file == signals.IMPORTS else "__del__"), file, "exec")
-    before, seen, others = [signal.getsignal(number) for number in BOTH], [], []
     try:
-        for number in BOTH:
-            for delay in (0.01, 60.0):
-                monkeypatch.setattr(signals, "DELAY", delay)
-                signal.signal(number, signals.not_swallowed(lambda number, frame: seen.append(number)))
-                exec(code, {"number": number})
-                assert not seen and not others
-                if delay > 1:
-                    signals.handle_signals(*2 * [lambda number, frame: others.append(number)])
-                end = time.monotonic() + 20
-                while not seen and not others and time.monotonic() < end:
-                    time.sleep(0.01)
-                assert (seen, others) == (([], [number]) if delay > 1 else ([number], []))
-                seen.clear()
-                others.clear()
+        for take_over in (False, True):
+            signal.signal(number, signals.not_swallowed(note("ours")))
+            exec(code, {"number": number})
+            assert not seen and len(timers) == 1
+            end_timer = timers.pop()
+            signals.handle_signals(note("theirs"), note("theirs")) if take_over else end_timer()
+            end = time.monotonic() + 20
+            while not seen and time.monotonic() < end:
+                time.sleep(0.001)
+            assert seen.pop() == ("theirs" if take_over else "ours", number)
     finally:
-        for number, handler in zip(BOTH, before):
-            signal.signal(number, handler)
+        for each, handler in zip(BOTH, before):
+            signal.signal(each, handler)
 
 
 THING = """
@@ -334,64 +339,3 @@ def test_ray_leaves_a_program_its_handler(monkeypatch):
             assert signal.getsignal(signal.SIGTERM) is kept
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-def test_progress_on_a_terminal_is_a_bar(monkeypatch):
-    pytest.importorskip("rich")
-    monkeypatch.setenv("TERM", "xterm")
-    stream, clock = Terminal(), iter([0.0, 0.1, 1.0, 2.0])
-    progress = progress_module.Progress(stream, clock=lambda: next(clock))
-    for done in (0, 1, 5, 10):
-        progress("LOD bounds", done, 10)
-    progress.close()
-    shown = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", stream.getvalue())
-    assert list(dict.fromkeys(re.findall(r"LOD bounds .* (\d+)%", shown.replace("\r", "\n")))) == ["0", "50", "100"]
-    assert stream.getvalue().endswith("\x1b[2K"), "the bar is cleared"
-
-
-@pytest.mark.parametrize("terminal", [False, True])
-def test_progress_without_a_bar_is_a_line_a_stage(monkeypatch, terminal):
-    monkeypatch.setitem(sys.modules, "rich", None)
-    stream, clock = (Terminal if terminal else io.StringIO)(), iter(range(100))
-    progress = progress_module.Progress(stream, clock=lambda: next(clock))
-    for stage in ("collapse", "LOD bounds"):
-        for done in range(5):
-            progress(stage, done, 4)
-    progress.close()
-    assert stream.getvalue() == "collapse ...\nLOD bounds ...\n"
-
-
-def test_long_stages_are_estimated():
-    """At 5 s, and whenever twice the time has gone by: of 1,000 steps of a second each."""
-    stream, now = io.StringIO(), [0]
-    progress = progress_module.Progress(stream, clock=lambda: now[0])
-    for done in range(101):
-        now[0] = done
-        progress("frames", done, 1000)
-    progress("other", 0, 2)
-    now[0] += 7
-    progress("other", 1, 2)
-    progress("other", 1, 2)
-    seen = [(5, "0:16:35"), (10, "0:16:30"), (20, "0:16:20"), (40, "0:16:00"), (80, "0:15:20")]
-    lines = [f"frames: {done} of 1,000, about {left} left" for done, left in seen]
-    for done in range(8):
-        now[0] += 1
-        progress("frames", done, 10**30)
-    lines += ["other ...", "other: 1 of 2, about 0:00:07 left", "frames ..."]
-    *seen, last = stream.getvalue().splitlines()
-    assert seen == ["frames ...", *lines] and last.endswith(", about years left")
-
-
-def test_compiling_is_announced(tmp_path, monkeypatch):
-    stream, now = io.StringIO(), time.monotonic()
-    (tmp_path / f"wp_module_p{os.getpid()}_t1").mkdir()
-    monkeypatch.setattr(progress_module.wp.config, "kernel_cache_dir", str(tmp_path))
-    with progress_module.compile_notice(stream, delay=0.0):
-        while not stream.getvalue() and time.monotonic() < now + 5:
-            time.sleep(0.05)
-    assert stream.getvalue().count("\n") == 1 and "compiling" in stream.getvalue()
