@@ -19,9 +19,14 @@ wp.init()
 ROOT = Path(__file__).resolve().parents[1]
 
 
+def slow_rows(*rows):
+    """Return cases of several parameters that are marked slow."""
+    return [pytest.param(*row, marks=pytest.mark.slow) for row in rows]
+
+
 def slow(*values):
     """Return cases of a parameter that are marked slow."""
-    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
+    return slow_rows(*([value] for value in values))
 
 
 @pytest.fixture(params=[str(device) for device in wp.get_devices()])

@@ -3,6 +3,7 @@
 import ast
 import re
 import sys
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -53,13 +54,21 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 FILES = [*PACKAGE, *KERNELS, *USERS, *TESTS]
 
 
+@cache
 def parse(source):
+    """Return the syntax tree of a file or a text, which nobody changes."""
     return ast.parse(source.read_text(encoding="utf-8") if isinstance(source, Path) else source)
+
+
+@cache
+def walk(tree):
+    """Return all nodes of a tree."""
+    return list(ast.walk(tree))
 
 
 def imports(tree, package):
     """Yield every imported (module, name, line); name is None for `import module`, relative imports made absolute."""
-    for node in ast.walk(tree):
+    for node in walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield alias.name, None, node.lineno
@@ -93,8 +102,9 @@ def direction_faults(tree, package):
 def hidden_import_faults(tree):
     """List imports by a string of what is the project's own, and tests that import tests."""
     faults = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("import_module", "__import__"):
+    for node in walk(tree):
+        called = getattr(node, "func", None)
+        if getattr(called, "attr", getattr(called, "id", None)) in ("import_module", "__import__"):
             if node.args and "warp_abtree" in ast.unparse(node.args[0]):
                 faults.append(f"line {node.lineno}: {ast.unparse(node)}")
     for module, _, line in imports(tree, "x"):
@@ -109,12 +119,12 @@ def private_faults(tree):
     """List private names of other modules and other objects; a class may use those of its own instances."""
     own = {
         node.name if isinstance(node, ast.FunctionDef) else node.attr
-        for node in ast.walk(tree)
+        for node in walk(tree)
         if isinstance(node, ast.FunctionDef)
         or (isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in ("self", "cls"))
     }
     faults = []
-    for node in ast.walk(tree):
+    for node in walk(tree):
         if isinstance(node, ast.Attribute) and re.match("_[a-z]", node.attr):
             of = ast.unparse(node.value)
             if of not in ("self", "cls", "super()", "os", "np") and node.attr not in own | WARP_PRIVATE:
@@ -163,7 +173,7 @@ def documented():
 def outside_faults(tree, public, package, known=frozenset()):
     """List what a user of the library takes from it beyond its public names and the modules of the API reference."""
     public, faults, aliases = {*public, *OPEN}, [], set()
-    for node in ast.walk(tree):
+    for node in walk(tree):
         if isinstance(node, ast.Import):
             aliases |= {alias.asname or "warp_abtree" for alias in node.names if alias.name == "warp_abtree"}
     for module, name, line in imports(tree, package):
@@ -172,7 +182,7 @@ def outside_faults(tree, public, package, known=frozenset()):
             continue
         if len(parts) > 1 or (name is not None and name not in public):
             faults.append(f"line {line}: {module}{'.' + name if name else ''} is not public")
-    for node in ast.walk(tree):
+    for node in walk(tree):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in aliases:
             if node.attr not in public:
                 faults.append(f"line {node.lineno}: warp_abtree.{node.attr} is not public")
@@ -182,7 +192,7 @@ def outside_faults(tree, public, package, known=frozenset()):
 def kernel_import_faults(tree):
     """List imports of a kernel file that leave kernels/, or are relative."""
     faults = []
-    for node in ast.walk(tree):
+    for node in walk(tree):
         if isinstance(node, ast.ImportFrom) and node.level:
             faults.append(f"line {node.lineno}: relative import")
     for module, name, line in imports(tree, "warp_abtree.kernels"):
@@ -218,7 +228,7 @@ def is_kernel(function):
 def kernel_faults(tree):
     """List kernels that are misnamed, or whose outputs do not come last."""
     faults = []
-    for node in ast.walk(tree):
+    for node in walk(tree):
         if not isinstance(node, ast.FunctionDef):
             continue
         if is_kernel(node) != node.name.endswith("_kernel"):
@@ -236,7 +246,7 @@ def size_faults(tree, text):
     """List functions that are too long or take too many arguments beside those by name, and a file that is too long."""
     count = len(text.splitlines())
     faults = [f"{count} lines"] if count > FILE_LINES else []
-    for node in ast.walk(tree):
+    for node in walk(tree):
         if not isinstance(node, ast.FunctionDef):
             continue
         lines = node.end_lineno - node.body[0].lineno + 1  # its signature apart
@@ -252,7 +262,7 @@ def size_faults(tree, text):
 def struct_faults(tree, text):
     """List fields of kernel structs without a comment beside or above them, and packed words without a diagram."""
     faults, lines = [], text.splitlines()
-    for node in ast.walk(tree):
+    for node in walk(tree):
         if isinstance(node, ast.ClassDef) and any("struct" in ast.unparse(mark) for mark in node.decorator_list):
             for field in node.body:
                 if isinstance(field, ast.AnnAssign):
@@ -268,7 +278,7 @@ def struct_faults(tree, text):
 def snippet_faults(tree):
     """List strings that hold more native code than a few lines."""
     faults = []
-    for node in ast.walk(tree):
+    for node in walk(tree):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             code = [line for line in node.value.splitlines() if re.search(r"[;{}]\s*(//.*|\\)?$", line)]
             if len(code) > SNIPPET_LINES:
@@ -284,10 +294,10 @@ def native_function_faults(text):
 
 def banned_faults(tree):
     """List identifiers that hold a word of the old house."""
-    names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
-    names |= {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-    names |= {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
-    names |= {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    names = {node.id for node in walk(tree) if isinstance(node, ast.Name)}
+    names |= {node.attr for node in walk(tree) if isinstance(node, ast.Attribute)}
+    names |= {node.arg for node in walk(tree) if isinstance(node, ast.arg)}
+    names |= {node.name for node in walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
     banned = re.compile(rf"(^|_)({'|'.join(BANNED)})(_|$)")
     return sorted(name for name in names if banned.search(name.lower()))
 

@@ -57,16 +57,28 @@ def test_every_module_stands_in_a_package():
     assert "app" not in taken, "nothing imports app"
 
 
-@pytest.mark.parametrize("path", PACKAGE, ids=shown)
-def test_packages_import_those_below(path):
-    tree = parse(path)
-    assert not direction_faults(tree, package_of(path))
-    assert not private_faults(tree)
-    if package_of(path).split(".")[1] == "app":
-        return
+def faults_in(paths, *rules):
+    """Return what rules, functions of a path, its tree and its text, find in each file where they find something."""
+    texts = {path: path.read_text(encoding="utf-8") for path in paths}
+    found = {shown(path): [rule(path, parse(path), text) for rule in rules] for path, text in texts.items()}
+    return {path: faults for path, faults in found.items() if any(faults)}
+
+
+def extras_at_import(path, tree, text):
+    """List packages beside those that the core needs which a module imports at its top."""
     at_import = ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], [])
     roots = {module.split(".")[0] for module, _, _ in imports(at_import, package_of(path))}
-    assert roots <= CORE_DEPENDENCIES | sys.stdlib_module_names, "extras are imported where they are used"
+    allowed = CORE_DEPENDENCIES | sys.stdlib_module_names
+    return [] if package_of(path).split(".")[1] == "app" else sorted(roots - allowed)
+
+
+def test_packages_import_those_below():
+    rules = (
+        lambda path, tree, text: direction_faults(tree, package_of(path)),
+        lambda path, tree, text: private_faults(tree),
+        extras_at_import,
+    )
+    assert faults_in(PACKAGE, *rules) == {}
 
 
 def test_no_module_imports_itself_by_way_of_others():
@@ -74,11 +86,13 @@ def test_no_module_imports_itself_by_way_of_others():
     assert find_cycle(edges) == []
 
 
-@pytest.mark.parametrize("path", USERS, ids=shown)
-def test_users_use_the_public_api(path):
-    tree = parse(path)
-    assert not outside_faults(tree, {*public_names(), "__version__"}, "bench", documented())
-    assert not private_faults(tree)
+def test_users_use_the_public_api():
+    names, open_names = {*public_names(), "__version__"}, documented()
+    rules = (
+        lambda path, tree, text: outside_faults(tree, names, "bench", open_names),
+        lambda path, tree, text: private_faults(tree),
+    )
+    assert faults_in(USERS, *rules) == {}
 
 
 def test_public_names_are_those_of_the_reference():
@@ -89,18 +103,15 @@ def test_public_names_are_those_of_the_reference():
     assert sorted(entries) == names, "each public name stands once in the API reference"
 
 
-@pytest.mark.parametrize("path", KERNELS, ids=shown)
-def test_kernels(path):
-    tree, text = parse(path), path.read_text(encoding="utf-8")
-    assert not kernel_import_faults(tree)
-    assert not kernel_faults(tree)
-    assert not struct_faults(tree, text)
-    assert not snippet_faults(tree)
-
-
-@pytest.mark.parametrize("path", KERNELS, ids=shown)
-def test_kernel_groups_import_those_below(path):
-    assert not group_faults(parse(path), group_of(path))
+def test_kernels():
+    rules = (
+        lambda path, tree, text: kernel_import_faults(tree),
+        lambda path, tree, text: kernel_faults(tree),
+        lambda path, tree, text: struct_faults(tree, text),
+        lambda path, tree, text: snippet_faults(tree),
+        lambda path, tree, text: group_faults(tree, group_of(path)),
+    )
+    assert faults_in(KERNELS, *rules) == {}
 
 
 def test_one_subject_has_one_word():
@@ -111,13 +122,15 @@ def test_one_subject_has_one_word():
     assert folders <= groups | {*MAY_IMPORT, "bench", "helpers", "oracles"}
 
 
-@pytest.mark.parametrize("path", FILES, ids=shown)
-def test_files(path):
-    tree, text = parse(path), path.read_text(encoding="utf-8")
-    assert not hidden_import_faults(tree)
-    assert not size_faults(tree, text)
-    assert not banned_faults(tree)
-    assert not title_faults(text)
+@pytest.mark.parametrize("paths", [PACKAGE, KERNELS, USERS, TESTS], ids=["package", "kernels", "users", "tests"])
+def test_files(paths):
+    rules = (
+        lambda path, tree, text: hidden_import_faults(tree),
+        lambda path, tree, text: size_faults(tree, text),
+        lambda path, tree, text: banned_faults(tree),
+        lambda path, tree, text: title_faults(text),
+    )
+    assert faults_in(paths, *rules) == {}
 
 
 def test_a_name_has_one_definition():

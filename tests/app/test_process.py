@@ -1,4 +1,4 @@
-"""The process of a command: progress on stderr, and SIGINT and SIGTERM, which leave no half-written file."""
+"""The process of a command: errors on stderr, and SIGINT and SIGTERM, which leave no half-written file."""
 
 import csv
 import io
@@ -11,24 +11,28 @@ import sys
 import threading
 import time
 import urllib.request
+import warnings
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
+from conftest import slow_rows
 from helpers.samples import SHUTTLE_SCENE
-from helpers.viewer import write_scene
+from helpers.viewer import run_command, write_scene
 
 import warp_abtree as ab
 from warp_abtree.app.cli import main as cli
-from warp_abtree.app.cli import progress as progress_module
+from warp_abtree.checks import signals
 from warp_abtree.jobs import RayPool
 from warp_abtree.jobs import ray_pool as cluster
 
 ROOT = Path(__file__).resolve().parents[2]
 INTERRUPT, TERMINATE = signal.SIGINT, signal.SIGTERM
 BOTH = (INTERRUPT, TERMINATE)
+# A process takes 2 to 3 s of a core, most of it to import: quick tests start one of each kind.
 # What a command of this process runs until the signal comes, which a line on stdout asks for.
 HANG = """
 import sys, time
@@ -72,23 +76,20 @@ def files(tmp_path, monkeypatch):
     return tmp_path
 
 
-SLOW = [
-    (BUILD, "np.savez_compressed", block, TERMINATE, 143, []),
-    ("run scene.toml --record new.csv", "ab.Frame.run", None, TERMINATE, 143, []),
-    ("run scene.toml --record new.json", "ab.Frame.run", ignore, INTERRUPT, 130, []),
-    (QUERY, "np.savez", block, INTERRUPT, 130, []),
-    (SWEEP, "np.savez", ignore, TERMINATE, 143, ["answers", "answers/job.json"]),
-    (VIEW, "_", ignore, INTERRUPT, 0, []),  # an interrupt is how people end it
-    (VIEW, "_", block, TERMINATE, 143, []),
-]
-
-
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize(
     ("words", "place", "before", "number", "status", "left"),
     [
         (BUILD, "np.savez_compressed", ignore, INTERRUPT, 130, []),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW),
+        *slow_rows(
+            (BUILD, "np.savez_compressed", block, TERMINATE, 143, []),
+            ("run scene.toml --record new.csv", "ab.Frame.run", None, TERMINATE, 143, []),
+            ("run scene.toml --record new.json", "ab.Frame.run", ignore, INTERRUPT, 130, []),
+            (QUERY, "np.savez", block, INTERRUPT, 130, []),
+            (SWEEP, "np.savez", ignore, TERMINATE, 143, ["answers", "answers/job.json"]),
+            (VIEW, "_", ignore, INTERRUPT, 0, []),  # an interrupt is how people end it
+            (VIEW, "_", block, TERMINATE, 143, []),
+        ),
     ],
 )
 def test_a_signal_stops_a_command(files, words, place, before, number, status, left):
@@ -152,7 +153,7 @@ sys.exit(cli.main())
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize("name", ["rows.csv", "rows.json"])
+@pytest.mark.parametrize("name", ["rows.csv", *slow_rows(["rows.json"])])
 def test_an_interrupted_run_keeps_its_rows(files, name):
     status, _, errors = run_process(f"run scene.toml --record {name} --device cpu", STOP_IN_FRAME)
     assert (status, errors) == (130, "warp-abtree: interrupted\n")
@@ -193,11 +194,13 @@ def test_the_version_needs_no_warp():
     ("module", "number", "delay", "told"),
     [
         ("warp", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
-        ("scipy.sparse", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
-        ("trimesh", TERMINATE, 0.01, (143, "warp-abtree: terminated\n")),
-        ("trimesh.exchange.gltf", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
         ("pxr", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),  # of a command that runs already
-        ("pxr", TERMINATE, 60.0, (143, "warp-abtree: terminated\n")),  # and that ends before it comes again
+        *slow_rows(
+            ("scipy.sparse", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
+            ("trimesh", TERMINATE, 0.01, (143, "warp-abtree: terminated\n")),
+            ("trimesh.exchange.gltf", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
+            ("pxr", TERMINATE, 60.0, (143, "warp-abtree: terminated\n")),  # and that ends before it comes again
+        ),
     ],
 )
 def test_a_signal_during_imports_is_not_caught(module, number, delay, told):
@@ -206,15 +209,62 @@ def test_a_signal_during_imports_is_not_caught(module, number, delay, told):
     assert (status, errors) == told
 
 
-# A signal comes while a finaliser runs, of which Python drops what is raised, or at the end of the process.
-STOP_IN_DEL = """
-import atexit, os, signal, sys
+SIGNALLED = "import os, time\ndef __del__():\n    os.kill(os.getpid(), number)\n    time.sleep(0.05)\n__del__()"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("number", BOTH)
+@pytest.mark.parametrize("file", ["model.py", signals.IMPORTS])
+def test_a_signal_waits_for_imports_and_finalisers(monkeypatch, file, number):
+    """It comes again once they have ended; and goes to handlers that others set before that."""
+    seen, timers, before = [], [], [signal.getsignal(each) for each in BOTH]
+
+    def note(kind):
+        return lambda number, frame: seen.append((kind, number))
+
+    def timer(_, send, arguments):
+        return SimpleNamespace(start=lambda: timers.append(partial(send, *arguments)))
+
+    monkeypatch.setattr(signals.threading, "Timer", timer)
+    code = compile(SIGNALLED.replace("__del__", "load" if file == signals.IMPORTS else "__del__"), file, "exec")
+    try:
+        for take_over in (False, True):
+            signal.signal(number, signals.not_swallowed(note("ours")))
+            exec(code, {"number": number})
+            assert not seen and len(timers) == 1
+            end_timer = timers.pop()
+            signals.handle_signals(note("theirs"), note("theirs")) if take_over else end_timer()
+            end = time.monotonic() + 20
+            while not seen and time.monotonic() < end:
+                time.sleep(0.001)
+            assert seen.pop() == ("theirs" if take_over else "ours", number)
+    finally:
+        for each, handler in zip(BOTH, before):
+            signal.signal(each, handler)
+
+
+THING = """
+import atexit, os, sys
 from warp_abtree.__main__ import main
-from warp_abtree.app.cli import model_commands
 
 class Thing:
     def __del__(self, kill=os.kill, number=os.getpid()):
         kill(number, 2)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_a_signal_after_the_last_code_changes_nothing():
+    """Done is done."""
+    told = run_process("--version", THING + "sys.kept = Thing()\nsys.exit(main())")
+    assert told == (0, f"warp-abtree {ab.__version__}\n", "")
+
+
+# A signal comes while a finaliser runs, of which Python drops what is raised, or at the end of the process.
+STOP_IN_DEL = (
+    THING
+    + """
+from warp_abtree.app.cli import model_commands
 
 def describe(mesh, described=model_commands.describe_mesh):
     thing = Thing()
@@ -230,15 +280,15 @@ def print_last(*result, print_result=model_commands.print_result):
 PLACE
 sys.exit(main())
 """
+)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize(
     ("place", "told"),
     [
-        ("model_commands.describe_mesh = describe", (130, False, "warp-abtree: interrupted\n")),
         ("model_commands.print_result = print_last", (130, True, "warp-abtree: interrupted\n")),
-        ("sys.kept = Thing()", (0, True, "")),  # after the last Python code: done is done
+        *slow_rows(("model_commands.describe_mesh = describe", (130, False, "warp-abtree: interrupted\n"))),
     ],
 )
 def test_a_signal_while_something_ends_is_not_dropped(files, place, told):
@@ -246,22 +296,24 @@ def test_a_signal_while_something_ends_is_not_dropped(files, place, told):
     assert (status, "diagonal" in shown, errors) == told
 
 
+@pytest.mark.slow
 def test_a_warning_is_one_line(files):
     Path("lines.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nl 1 2\n")
     status, _, errors = run_process("info lines.obj --device cpu")
     assert (status, errors) == (0, "warp-abtree: lines.obj: left out lines\n")
 
 
-def test_a_kernel_cache_that_cannot_be_written_names_its_variable(files):
+def test_a_kernel_cache_that_cannot_be_written_names_its_variable(files, capsys):
     status, _, errors = run_process("info ball.obj --device cpu", WARP_CACHE_PATH=str(files / "ball.obj" / "cache"))
     assert status == 2 and errors.count("\n") == 1 and "ball.obj/cache" in errors
     assert errors.endswith("(Warp's kernel cache; WARP_CACHE_PATH names a folder that can be written)\n")
-    status, _, errors = run_process("info gone.obj --device cpu")
-    assert status == 2 and "WARP_CACHE_PATH" not in errors
+    _, (error,) = run_command(capsys, "info", "gone.obj", "--device", "cpu", status=2)
+    assert "WARP_CACHE_PATH" not in error
 
 
 def test_a_caller_keeps_its_signals(files, capsys, monkeypatch):
     """Of a command that is called, and of a program's that runs in another thread than the main one."""
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
     before = [signal.getsignal(number) for number in BOTH]
     words = ["info", "ball.obj", "--device", "cpu"]
     assert cli.main(words) == 0
@@ -272,6 +324,7 @@ def test_a_caller_keeps_its_signals(files, capsys, monkeypatch):
     thread.join()
     assert status == [0] and not capsys.readouterr().err
     assert [signal.getsignal(number) for number in BOTH] == before
+    assert warnings.formatwarning(UserWarning("a\nb"), UserWarning, "some.py", 7) == "warp-abtree: a\nb\n"
 
 
 def test_ray_leaves_a_program_its_handler(monkeypatch):
@@ -286,67 +339,3 @@ def test_ray_leaves_a_program_its_handler(monkeypatch):
             assert signal.getsignal(signal.SIGTERM) is kept
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-def test_progress_on_a_terminal_is_a_bar(monkeypatch):
-    pytest.importorskip("rich")
-    monkeypatch.setenv("TERM", "xterm")
-    stream, clock = Terminal(), iter([0.0, 0.1, 1.0, 2.0])
-    progress = progress_module.Progress(stream, clock=lambda: next(clock))
-    for done in (0, 1, 5, 10):
-        progress("LOD bounds", done, 10)
-    progress.close()
-    shown = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", stream.getvalue())
-    assert list(dict.fromkeys(re.findall(r"LOD bounds .* (\d+)%", shown.replace("\r", "\n")))) == ["0", "50", "100"]
-    assert stream.getvalue().endswith("\x1b[2K"), "the bar is cleared"
-
-
-@pytest.mark.parametrize("terminal", [False, True])
-def test_progress_without_a_bar_is_a_line_a_stage(monkeypatch, terminal):
-    monkeypatch.setitem(sys.modules, "rich", None)
-    stream, clock = (Terminal if terminal else io.StringIO)(), iter(range(100))
-    progress = progress_module.Progress(stream, clock=lambda: next(clock))
-    for stage in ("collapse", "LOD bounds"):
-        for done in range(5):
-            progress(stage, done, 4)
-    progress.close()
-    assert stream.getvalue() == "collapse ...\nLOD bounds ...\n"
-
-
-def test_long_stages_are_estimated():
-    """At 5 s, and whenever twice the time has gone by: of 1,000 steps of a second each."""
-    stream, now = io.StringIO(), [0]
-    progress = progress_module.Progress(stream, clock=lambda: now[0])
-    for done in range(101):
-        now[0] = done
-        progress("frames", done, 1000)
-    progress("other", 0, 2)
-    now[0] += 7
-    progress("other", 1, 2)
-    progress("other", 1, 2)
-    seen = [(5, "0:16:35"), (10, "0:16:30"), (20, "0:16:20"), (40, "0:16:00"), (80, "0:15:20")]
-    lines = [f"frames: {done} of 1,000, about {left} left" for done, left in seen]
-    assert stream.getvalue().splitlines() == ["frames ...", *lines, "other ...", "other: 1 of 2, about 0:00:07 left"]
-
-
-def test_an_estimate_of_years_is_one():
-    stream, clock = io.StringIO(), iter(range(100))
-    progress = progress_module.Progress(stream, clock=lambda: next(clock))
-    for done in range(8):
-        progress("frames", done, 10**30)
-    assert stream.getvalue().splitlines()[1].endswith(", about years left")
-
-
-def test_compiling_is_announced(tmp_path, monkeypatch):
-    stream, now = io.StringIO(), time.monotonic()
-    (tmp_path / f"wp_module_p{os.getpid()}_t1").mkdir()
-    monkeypatch.setattr(progress_module.wp.config, "kernel_cache_dir", str(tmp_path))
-    with progress_module.compile_notice(stream, delay=0.0):
-        while not stream.getvalue() and time.monotonic() < now + 5:
-            time.sleep(0.05)
-    assert stream.getvalue().count("\n") == 1 and "compiling" in stream.getvalue()

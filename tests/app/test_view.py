@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import refused
-from helpers.viewer import BODIES, make_models, make_playback, place, write_scene
+from helpers.viewer import BODIES, make_models, make_playback, write_scene
+from oracles.motion import posed
 
 import warp_abtree as ab
 from warp_abtree.app import load_scene
@@ -46,7 +47,7 @@ def test_intersecting_faces_and_triangles(playback):
         mine = [(i, face) for i, face in intersecting.tolist() if playback.scene.object_model[i] == owner]
         for (i, face), found in list(zip(mine, corners))[::7]:
             vertices, faces, ids = playback.scene.models[owner].mesh_at(int(snapshot.lods[i]))
-            assert np.allclose(found, place(snapshot.poses[i], vertices[faces[ids == face][0]]), atol=1e-6)
+            assert np.allclose(found, posed(vertices[faces[ids == face][0]], snapshot.poses[i]), atol=1e-6)
     only = geometry.intersecting_faces(result, np.array([True, True, False]))
     assert set(only[:, 0].tolist()) == {0, 1} and len(only) < len(intersecting)
 
@@ -75,7 +76,7 @@ def test_bounds_hold_all_that_is_shown(playback):
     centre, radius = geometry.bounds(geometry.MeshCache(playback.scene), snapshot, np.arange(3))
     for i in range(3):
         vertices = playback.scene.models[playback.scene.object_model[i]].mesh_at(int(snapshot.lods[i]))[0]
-        assert np.linalg.norm(place(snapshot.poses[i], vertices) - centre, axis=1).max() <= radius * (1 + 1e-9)
+        assert np.linalg.norm(posed(vertices, snapshot.poses[i]) - centre, axis=1).max() <= radius * (1 + 1e-9)
     assert radius < 6
 
 

@@ -24,7 +24,6 @@ import warp_abtree as ab
 from warp_abtree import testing
 
 NAMES = ("box", "small ball", "crumbs", "soup", "torus", "capsule", "lattice soup", "twins", "grid", "three", "one")
-VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
 
 
 @pytest.fixture(params=["threads", "warps"])

@@ -12,7 +12,7 @@ from helpers.bodies import FLOOR, about, box, model_of
 from helpers.contacts import ask_points
 from helpers.questions import to_matrix
 from helpers.samples import STILL, random_poses
-from helpers.viewer import place
+from oracles.motion import posed
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
@@ -54,7 +54,7 @@ def test_a_box_at_a_floor_has_its_four_corners(device, splits, height, gap):
     check_upward(points, 1e-9 if gap else 1e-12)
     np.testing.assert_allclose(points["depth"], -height, atol=1e-12)
     for x, y in itertools.product((-0.5, 0.5), (-0.4, 0.4)):
-        away = np.linalg.norm(points["point"] - place(pose, [x, y, -0.3]), axis=1)
+        away = np.linalg.norm(points["point"] - posed(np.array([x, y, -0.3]), np.array(pose)), axis=1)
         # On faces of one another the place of a point is that of a column, one of many.
         coarse, fine = (0.02, 0.2) if gap else (1e-9, 0.15)
         assert away.min() < (coarse if splits == (0, 0) else fine)

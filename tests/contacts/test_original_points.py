@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import trimesh
-import warp as wp
 from helpers.bodies import FLOOR, about, model_of
 from helpers.scenes import scene_with
+from oracles.distance import brute_distances
+from oracles.motion import posed
 
 import warp_abtree as ab
 
@@ -25,25 +26,9 @@ def wavy_plate():
 MODELS = wavy_plate()
 
 
-def nearest(x, triangles):
-    """Return the distance of a point from the nearest of some triangles, by its edges and its inside."""
-    a, b, c = (triangles[:, k] for k in range(3))
-    n = np.cross(b - a, c - a)
-    n /= np.linalg.norm(n, axis=1)[:, None]
-    height = np.einsum("ij,ij->i", x - a, n)
-    inside, least = np.ones(len(a), bool), np.full(len(a), np.inf)
-    for p, q in ((a, b), (b, c), (c, a)):
-        edge = q - p
-        s = np.clip(np.einsum("ij,ij->i", x - p, edge) / np.einsum("ij,ij->i", edge, edge), 0, 1)
-        least = np.minimum(least, np.linalg.norm(p + s[:, None] * edge - x, axis=1))
-        inside &= np.einsum("ij,ij->i", np.cross(edge, x - height[:, None] * n - p), n) >= 0
-    return np.where(inside, np.abs(height), least).min()
-
-
 def world_triangles(model, pose):
     vertices, faces = model.mesh_at(model.lod_max)[:2]
-    r = np.array(wp.quat_to_matrix(wp.quatd(*pose[3:]))).reshape(3, 3)
-    return (vertices @ r.T + pose[:3])[faces]
+    return posed(vertices, pose)[faces]
 
 
 def ask(device, pose, fraction, **options):
@@ -54,12 +39,9 @@ def ask(device, pose, fraction, **options):
 
 def off_middle(points, triangles):
     """Return how far points that are apart are from the middle of two surfaces, and their depths from the distance."""
-    found = []
-    for x, depth in zip(points["point"], points["depth"]):
-        if depth < 0:
-            far = [nearest(x, own) for own in triangles]
-            found.append((abs(far[0] - far[1]), abs(far[0] + far[1] + depth)))
-    return found
+    apart = points["depth"] < 0
+    a, b = (brute_distances(points["point"][apart], own) for own in triangles) if apart.any() else np.zeros((2, 0))
+    return [*zip(np.abs(a - b), np.abs(a + b + points["depth"][apart]))]
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])

@@ -7,32 +7,26 @@ import warp as wp
 from helpers.bodies import FLOOR, about, box, model_of
 from helpers.samples import sample
 from helpers.scenes import scene_with
+from oracles.motion import posed
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.checks.quaternions import multiply_quaternions
 
 GAP, REST = 0.08, 0.01
 
 
-def turn_of(pose):
-    return quaternion_matrix(pose[3:])
-
-
 def see(pose, points):
     """Return points of the world in the frame of a pose."""
-    return (np.asarray(points) - pose[:3]) @ turn_of(pose)
-
-
-def place(pose, points):
-    return points @ turn_of(pose).T + pose[:3]
+    return (np.asarray(points) - pose[:3]) @ quaternion_matrix(pose[3:])
 
 
 def at(x, y, z):
     return (x, y, z, 0, 0, 0, 1.0)
 
 
-def posed(rng, away=0.0, angle=0.0):
+def near_rest(rng, away=0.0, angle=0.0):
     """Return a pose near that of a cube on the floor, off by so much."""
     return np.array([*(rng.normal(size=3) * away + [0, 0, 0.49]), *about(rng.normal(size=3), angle)])
 
@@ -51,7 +45,7 @@ def test_points_of_a_pair_that_rests_move_with_its_objects(device, order):
     """Each is the middle of what was one point of either, less deep as these come apart: in NumPy, both move."""
     rng, (scene, query) = np.random.default_rng(0), make(device, pairs=[order])
     for _ in range(20):
-        floor, cube = np.array(FLOOR, float), posed(rng, 0.01, 0.02)
+        floor, cube = np.array(FLOOR, float), near_rest(rng, 0.01, 0.02)
         scene.set_poses([floor, cube])
         query.forget()
         first = query.run().points
@@ -59,25 +53,18 @@ def test_points_of_a_pair_that_rests_move_with_its_objects(device, order):
         carry = np.array([*rng.normal(size=3), *about(rng.normal(size=3), 1.0)])  # both, together
         shift = rng.normal(size=3)
         cube_now = cube + [*(0.9 * REST * rng.random() * shift / np.linalg.norm(shift)), 0, 0, 0, 0]
-        now = [[*(place(carry, x[None, :3])[0]), *multiply(carry[3:], x[3:])] for x in (floor, cube_now)]
+        now = [[*(posed(x[None, :3], carry)[0]), *multiply_quaternions(carry[3:], x[3:])] for x in (floor, cube_now)]
         scene.set_poses(now)
         points = query.run().points
         assert is_resting(query)[0] and query.hits.count.numpy()[0] == 0
-        of_floor = place(np.array(now[0]), see(floor, first["point"]))
-        of_cube = place(np.array(now[1]), see(cube, first["point"]))
-        normal = first["normal"] @ turn_of(carry).T
+        of_floor = posed(see(floor, first["point"]), np.array(now[0]))
+        of_cube = posed(see(cube, first["point"]), np.array(now[1]))
+        normal = first["normal"] @ quaternion_matrix(carry[3:]).T
         np.testing.assert_allclose(points["normal"], normal, atol=1e-12)
         np.testing.assert_allclose(points["point"], (of_floor + of_cube) / 2, atol=1e-12)
         apart = of_cube - of_floor if order == (0, 1) else of_floor - of_cube
         depth = first["depth"] - np.einsum("ij,ij->i", apart, normal)
         np.testing.assert_allclose(points["depth"], depth, atol=1e-12)
-
-
-def multiply(p, q):
-    """Return the product of two quaternions, x y z w."""
-    x, w = np.asarray(p[:3]), p[3]
-    y, v = np.asarray(q[:3]), q[3]
-    return [*(w * y + v * x + np.cross(x, y)), w * v - x @ y]
 
 
 @pytest.mark.parametrize("distance", [True, 0.002])
@@ -98,8 +85,10 @@ def test_a_pair_rests_while_no_corner_has_moved_farther(device, distance, lower)
         query.run()
         shift, axis = rng.normal(size=3), rng.normal(size=3)
         turn = np.array([0, 0, 0, *about(axis, rng.normal() * limit)])
-        pose = np.array([*(place(turn, start[None, :3])[0] + 0.5 * limit * shift), *multiply(turn[3:], start[3:])])
-        moved = np.linalg.norm(place(pose, corners) - place(start, corners), axis=1).max()
+        pose = np.array(
+            [*(posed(start[None, :3], turn)[0] + 0.5 * limit * shift), *multiply_quaternions(turn[3:], start[3:])]
+        )
+        moved = np.linalg.norm(posed(corners, pose) - posed(corners, start), axis=1).max()
         if abs(moved / limit - 1) < 1e-4:  # root boxes are in float32
             continue
         scene.set_poses([still, pose] if lower == 0 else [pose, still])
@@ -156,7 +145,7 @@ def same_points(points, others):
 def test_points_know_their_place_in_the_launch_before(device):
     """Of pairs that rest and of those that are searched: mutual nearest points, in NumPy, as objects have moved."""
     rng, (scene, query) = np.random.default_rng(6), make(device)
-    reach, pose, last, kinds = 2.0**-5 * 0.5 * 3**0.5, posed(rng, 0.01, 0.02), None, set()
+    reach, pose, last, kinds = 2.0**-5 * 0.5 * 3**0.5, near_rest(rng, 0.01, 0.02), None, set()
     for step in range(40):
         scene.set_poses([FLOOR, pose])
         points = query.run().points
@@ -164,7 +153,7 @@ def test_points_know_their_place_in_the_launch_before(device):
             expected = np.full(len(points["depth"]), -1)
         else:
             # Where each of the last launch is now: the middle of what moved with either.
-            moved = 0.5 * (last[1] + place(pose, see(last[0], last[1])))
+            moved = 0.5 * (last[1] + posed(see(last[0], last[1]), pose))
             far = np.linalg.norm(points["point"][:, None] - moved[None], axis=2)
             alike = (points["normal"] @ last[2].T > 0.5) & (far < reach)
             # That the nearest of a place may be a point of another normal counts, too.
@@ -182,7 +171,7 @@ def test_points_know_their_place_in_the_launch_before(device):
         last = pose.copy(), points["point"], points["normal"]
         pose = pose.copy()
         pose[:2] += rng.normal(size=2) * (0.2 * REST if step % 3 else 2 * REST)
-        pose[3:] = multiply(about(rng.normal(size=3), 0.001), pose[3:])
+        pose[3:] = multiply_quaternions(about(rng.normal(size=3), 0.001), pose[3:])
     assert {(True, False), (False, False), (False, True)} <= kinds
     query.forget()
     assert (query.run().points["before"] == -1).all()
@@ -304,7 +293,7 @@ def run_walk(device):
     for k in range(24):
         step = rng.normal(size=3) * (0.2 if k % 7 == 0 else 0.3 * REST)
         pose[:3] += [step[0], step[1], 0.02 * step[2]]
-        pose[3:] = multiply(about(rng.normal(size=3), 0.001), pose[3:])
+        pose[3:] = multiply_quaternions(about(rng.normal(size=3), 0.001), pose[3:])
         scene.set_poses([FLOOR, pose])
         points = query.run().points
         found.append(is_resting(query).tobytes() + b"".join(np.ascontiguousarray(x).tobytes() for x in points.values()))

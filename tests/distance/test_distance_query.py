@@ -17,7 +17,7 @@ from helpers.questions import (
     scene_of,
     to_matrix,
 )
-from helpers.samples import random_poses, sample
+from helpers.samples import grid, random_poses, sample
 from helpers.scenes import scene_with
 from oracles.distance import mesh_distance
 from oracles.triangle import quaternion_matrix, triangles_intersect
@@ -213,7 +213,8 @@ def test_what_a_search_starts_from_changes_nothing(device):
 
 def test_equally_near_faces_give_the_lowest(device):
     """Flat sheets over one another, and closed boxes: very many pairs of faces are as near."""
-    scene = scene_with(device, *[(sample(n), (0, 0, z, 0, 0, 0, 1)) for n in ("grid", "box") for z in (0, 2)])
+    models = ab.Model.from_arrays(*grid(5), base_faces=4), sample("box")
+    scene = scene_with(device, *[(model, (0, 0, z, 0, 0, 0, 1)) for model in models for z in (0, 2)])
     for a, b in ((0, 1), (2, 3)):
         found = scene.intersect([(a, b), (b, a)], "distance")
         vertices, faces, _ = (model := scene.models[scene.object_model[a]]).mesh_at(model.lod_max)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from conftest import slow
 from helpers.questions import pairs_of, random_lod, scene_of, to_matrix
 from helpers.samples import STILL, grid, random_poses, random_quaternions, sample
 from oracles.distance import mesh_distance
@@ -78,20 +79,20 @@ def anchored_sheets(rng, roughness, far, aside):
     return models, poses
 
 
-@pytest.mark.parametrize("roughness", [pytest.param(1e-6, marks=pytest.mark.slow), 1e-8, 1e-10])
+@pytest.mark.parametrize("roughness", [*slow(1e-6), 1e-8, 1e-10])
 @pytest.mark.parametrize("far", [0.0, 100.0])
 @pytest.mark.parametrize("bend", [0.0, 0.3])
 def test_nearly_equally_near_faces(device, roughness, far, bend):
     rng = np.random.default_rng(1)
-    check_sheets(device, [sheets(rng, roughness, far, bend) for _ in range(3)], 1 + far)
+    check_sheets(device, [sheets(rng, roughness, far, bend) for _ in range(2)], 1 + far)
 
 
-@pytest.mark.parametrize("roughness", [pytest.param(1e-6, marks=pytest.mark.slow), 1e-8])
+@pytest.mark.parametrize("roughness", [*slow(1e-6), 1e-8])
 @pytest.mark.parametrize("far", [3.0, 100.0])
 @pytest.mark.parametrize("aside", [0.1, 0.0])
 def test_nearly_equally_near_faces_of_large_objects(device, roughness, far, aside):
     rng = np.random.default_rng(3)
-    check_sheets(device, [anchored_sheets(rng, roughness, far, aside) for _ in range(8)], 1 + far)
+    check_sheets(device, [anchored_sheets(rng, roughness, far, aside) for _ in range(4)], 1 + far)
 
 
 def check_sheets(device, sheets, size):
@@ -109,17 +110,20 @@ def check_sheets(device, sheets, size):
 def check_queries(query, truths, size):
     first = query.run()
     assert first.distance[: len(truths)] == pytest.approx(truths, rel=1e-13, abs=1e-15 * size)
-    for turn in range(20):
+    slabs, with_slabs = query.stages[-1].slabs.made, 0
+    for _ in range(20):
         query.launch()
         assert to_bytes(query.result()) == to_bytes(first)
-        if turn > 16:
+        if (slabs.numpy()[:, 0] >= 0).sum() == len(query.batch.states.slots):
             query.forget()
-    made = query.stages[-1].slabs.made.numpy()[:, 0] >= 0
-    assert made.sum() == len(query.batch.states.slots), "slabs of all states"
+            with_slabs += 1
+            if with_slabs == 3:
+                return
+    raise AssertionError("there are no slabs of all states")
 
 
 @pytest.mark.parametrize("far", [0.0, 100.0])
-@pytest.mark.parametrize("roughness", [1e-7, 1e-9])
+@pytest.mark.parametrize("roughness", [*slow(1e-7), 1e-9])
 def test_very_many_nearly_equally_near_faces(device, roughness, far):
     """So many that slabs are compared along the nodes' own normals, on the CPU; warps have none for so few pairs."""
     rng = np.random.default_rng(4)

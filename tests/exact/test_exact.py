@@ -127,7 +127,8 @@ def check_all(device, cases):
 @pytest.mark.parametrize("names", [("warp:bunny", "warp:bear"), ("torus", "ball")], ids="-".join)
 def test_every_distance_from_the_origin_is_exact(device, names):
     """Up to 1e7 model sizes, of the poses and of the models' own coordinates."""
-    models = [ab.Model.from_arrays(*coarse(name), base_faces=10**6) for name in names]
+    meshes = [coarse(name, 250) for name in names]
+    models = [ab.Model.from_arrays(*mesh, base_faces=10**6) for mesh in meshes]
     poses = contact_poses(np.random.default_rng(6), models[0], models[0].lod_max, models[1], models[1].lod_max)
     way = np.array([1.0, -0.7, 0.3])
     cases = []
@@ -135,7 +136,7 @@ def test_every_distance_from_the_origin_is_exact(device, names):
         far = 10.0**power * way
         shift = np.concatenate([far, np.zeros(4)])
         cases.append((models[0], None, poses[0] + shift, models[1], None, poses[1] + shift))
-        a, b = (ab.Model.from_arrays(coarse(n)[0] + far, coarse(n)[1], base_faces=10**6) for n in names)
+        a, b = (ab.Model.from_arrays(vertices + far, faces, base_faces=10**6) for vertices, faces in meshes)
         cases.append((a, None, STILL, b, None, STILL))
         turned = random_poses(np.random.default_rng(power), 1, 1.0)[0]
         cases.append((a, None, turned, a, None, turned))

@@ -112,6 +112,26 @@ def touching_shapes(contacts):
     return {tuple(sorted(pair)) for pair in np.stack(contact_rows(contacts, "shape0", "shape1"), 1).tolist()}
 
 
+class PairContacts:
+    """Stands for a `newton.CollisionPipeline` of given pairs: a contact each, wherever the shapes are."""
+
+    def __init__(self, model, *, broad_phase, shape_pairs_filtered, rigid_contact_max, deterministic):
+        self.device, self.shape_pairs_filtered = model.device, shape_pairs_filtered
+        self.rigid_contact_max = rigid_contact_max
+        self.shapes = [wp.array(column, device=self.device) for column in shape_pairs_filtered.numpy().T.copy()]
+
+    def contacts(self):
+        import newton
+
+        return newton.Contacts(self.rigid_contact_max, 0, device=self.device)
+
+    def collide(self, state, contacts):
+        contacts.clear()
+        contacts.rigid_contact_count.fill_(len(self.shapes[0]))
+        for side, shapes in enumerate(self.shapes):
+            wp.copy(getattr(contacts, f"rigid_contact_shape{side}"), shapes)
+
+
 def settle(model, found, steps, iterations=2):
     """Step bodies by a solver of Newton's; return their poses and the last contacts."""
     import newton

@@ -3,9 +3,7 @@
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 import trimesh
-from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
 from helpers.samples import SHUTTLE_SCENE
@@ -41,11 +39,6 @@ position = [0, -1.4, 0]
 model = "ball"
 position = [0, 0.2, 0]
 """
-
-
-def place(pose, points):
-    """Return points (n, 3) of a model in the world."""
-    return np.asarray(points) @ quaternion_matrix(pose[3:]).T + pose[:3]
 
 
 def write_scene(folder, text=SCENE):

@@ -53,7 +53,7 @@ def test_rays_through_corners_edges_and_faces(device, seed):
         vertices = vertices * 2 + rng.integers(-2, 3, vertices.shape)
     triangles = vertices[faces]
     # In the middle of cells, at the height of corners, on lines through edges: never on the surface.
-    grid = rng.integers(-2, 18, (600, 3)) * 0.5
+    grid = rng.integers(-2, 18, (200, 3)) * 0.5
     middles = (triangles[:, 0] + triangles[:, 1]) / 2 + rng.integers(-1, 2, (len(faces), 3)) * 0.25
     points = np.concatenate([grid, middles, vertices + np.eye(3)[rng.integers(0, 3, len(vertices))] * 0.5])
     if seed == 2:
@@ -68,7 +68,7 @@ def test_rays_through_corners_edges_and_faces(device, seed):
         except AssertionError:
             continue
     found = launch(parity_kernel, device, len(kept), np.array(kept), triangles, columns=6)
-    assert len(kept) > 300 and 20 < sum(expected) < len(kept)
+    assert len(kept) > 250 and 20 < sum(expected) < len(kept)
     np.testing.assert_array_equal(found, np.repeat(np.array(expected, int)[:, None], 6, axis=1))
 
 

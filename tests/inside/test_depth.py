@@ -10,6 +10,7 @@ from helpers.questions import captured
 from helpers.samples import random_poses
 from helpers.scenes import scene_with
 from helpers.solids import ask, lattice_pose, model_of, moved, shell, voxel_mesh
+from oracles.distance import brute_distances
 from oracles.inside import parity
 from oracles.motion import posed
 from oracles.triangle import into_frame_of_a
@@ -23,24 +24,17 @@ KNOT = ab.Model.load(trimesh.creation.torus(1, 0.45, major_sections=14, minor_se
 
 
 def samples(triangles):
-    """Corners, middles of edges and centroids, (7 n, 3), and the face of each."""
+    """Corners, middles of edges and centroids, (7 n, 3)."""
     middles = (triangles + np.roll(triangles, -1, axis=1)) / 2
-    points = np.concatenate([triangles, middles, triangles.mean(1, keepdims=True)], axis=1)
-    return points.reshape(-1, 3), np.repeat(np.arange(len(triangles)), 7)
+    return np.concatenate([triangles, middles, triangles.mean(1, keepdims=True)], axis=1).reshape(-1, 3)
 
 
-def brute_depth(inner, outer):
-    """Greatest depth of samples of one surface in the other: 0 where there are none, or all lie on it."""
-    points, _ = samples(inner)
+def greatest_depth(points, outer):
+    """Return the greatest depth of points in a surface, by brute force: 0 where all are outside, or on it."""
     near = ((points >= outer.min((0, 1))) & (points <= outer.max((0, 1)))).all(1)
     points = np.unique(points[near], axis=0)
-    deepest = 0.0
-    for point in points:
-        found = trimesh.triangles.closest_point(outer, np.tile(point, (len(outer), 1)))
-        depth = np.linalg.norm(found - point, axis=1).min()
-        if depth > max(deepest + 1e-14, 1e-12) and parity(point, outer):
-            deepest = depth
-    return deepest
+    depths = brute_distances(points, outer) if len(points) else np.zeros(0)
+    return next((depths[k] for k in np.argsort(-depths) if depths[k] > 1e-12 and parity(points[k], outer)), 0.0)
 
 
 def check_row(result, row, meshes, poses, solid, tolerance=1e-12):
@@ -48,7 +42,8 @@ def check_row(result, row, meshes, poses, solid, tolerance=1e-12):
     a, b = sorted(result.pairs[row].tolist())
     other = into_frame_of_a(meshes[b][0], poses[a], poses[b])[meshes[b][1]]
     own = meshes[a][0][meshes[a][1]]
-    expected = max(brute_depth(own, other) if solid[b] else 0.0, brute_depth(other, own) if solid[a] else 0.0)
+    depths = [greatest_depth(samples(own), other), greatest_depth(samples(other), own)]
+    expected = max(depths[0] * solid[b], depths[1] * solid[a])
     depth = -result.distance[row]
     assert abs(depth - expected) <= tolerance
     if depth > 0:
@@ -64,7 +59,7 @@ def check_row(result, row, meshes, poses, solid, tolerance=1e-12):
     return depth
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_depths_are_those_of_brute_force(device, seed):
     rng = np.random.default_rng(seed)
     scene = scene_with(device, *[((KNOT, BALL)[i % 2], moved(), {"solid": i % 4 != 3}) for i in range(8)])
@@ -80,7 +75,7 @@ def test_depths_are_those_of_brute_force(device, seed):
         meshes = [scene.models[m].mesh_at(lod) for m, lod in zip(scene.object_model, lods)]
         np.testing.assert_array_equal(result.any, plain.any)
         np.testing.assert_array_equal(np.maximum(result.distance, 0), plain.distance)
-        for row in np.flatnonzero(result.any)[:: 1 if fraction < 1 else 4]:
+        for row in np.flatnonzero(result.any)[:: 1 if fraction < 1 else 8]:
             deep += check_row(result, row, meshes, poses, scene.object_solid) > 0
     assert deep > 10
 
@@ -149,7 +144,7 @@ def test_lattice_bodies(device):
         if found.any[0]:
             meshes = [model.mesh_at(model.lod_max)[:2] for model in models]
             own, other = meshes[0][0][meshes[0][1]], into_frame_of_a(meshes[1][0], *poses)[meshes[1][1]]
-            expected = max(brute_depth(own, other), brute_depth(other, own))
+            expected = max(greatest_depth(samples(own), other), greatest_depth(samples(other), own))
             assert -found.distance[0] == pytest.approx(expected, abs=1e-12)
             deep += expected > 0
     assert deep > 2
@@ -252,14 +247,6 @@ def depth_in(point, triangles):
     return away.min(), near[away.argmin()]
 
 
-def greatest_depth(inner, outer):
-    """Greatest depth of corners of one surface inside the other, by brute force."""
-    corners = np.unique(inner.reshape(-1, 3), axis=0)
-    corners = corners[((corners > outer.min((0, 1))) & (corners < outer.max((0, 1)))).all(1)]
-    depths = np.array([depth_in(x, outer)[0] for x in corners])
-    return next((depths[k] for k in np.argsort(-depths) if parity(corners[k], outer)), 0.0)
-
-
 @pytest.mark.parametrize("models", [(BALL, RING), (RING, RING)])
 def test_a_pair_is_as_deep_as_its_deepest_corner(device, models):
     """Of corners whose way out is on the side of the others'; and never deeper than any way out."""
@@ -273,7 +260,7 @@ def test_a_pair_is_as_deep_as_its_deepest_corner(device, models):
             continue
         assert len(points["pair"]) <= 8
         sides = [triangles_of(*placed) for placed in zip(models, poses)]
-        deepest = max(greatest_depth(*sides), greatest_depth(*sides[::-1]))
+        deepest = max(greatest_depth(a.reshape(-1, 3), b) for a, b in (sides, sides[::-1]))
         known = {tuple(x) for x in plain["point"].tolist()}
         for x, normal, depth in zip(*(points[name] for name in ("point", "normal", "depth"))):
             if tuple(x.tolist()) in known:

@@ -313,13 +313,6 @@ def crowd(count):
     return np.concatenate([vertices, round_, [[3.0, 1.0, 2.0]]]), np.concatenate([faces, fan])
 
 
-def tangle(vertex_count, face_count):
-    """Faces between random places of a coarse lattice: merges far apart cover the same triangles."""
-    rng = np.random.default_rng(1)
-    faces = rng.integers(0, vertex_count, (face_count, 3))
-    return rng.integers(0, 64, (vertex_count, 3)) / 64, faces
-
-
 MESHES = {
     "waves": lambda: waves(48),
     "flat": lambda: height_field(24, lambda x, y: 0 * x),

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import trimesh
+from conftest import slow
 from helpers import refused
 from helpers.motions import STILL, find, random_motions
 from helpers.questions import in_a_row
@@ -80,16 +81,16 @@ def test_lattice_seen_askew(kind, device):
     A matrix of whole numbers of 40 bits changes no answer, but rounds what is computed.
     """
     rng = np.random.default_rng(1)
-    starts, ends = lattice(rng, 500, 200)
+    starts, ends = lattice(rng, 250, 100)
     askew = rng.integers(-(2**40), 2**40, (3, 3)).astype(float)
     meets = truth(kind, starts, ends)
-    assert 150 < meets.sum() < 350
+    assert 75 < meets.sum() < 175
     for m in (np.eye(3), askew):
         _, clear, undecided = answers(kind, starts @ m, ends @ m, device)
         assert clear.tolist() == (~meets).tolist() and not undecided.any()
 
 
-@pytest.mark.parametrize("count", [600, pytest.param(1500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [300, *slow(1500)])
 @pytest.mark.parametrize("kind", KINDS)
 def test_lattice_moved_by_very_little(kind, count, device):
     """Gaps down to 2^-90 and, where corners nearly meet edges in line, squares of that: nothing is missed."""

@@ -140,7 +140,7 @@ def test_contacts_are_not_late_where_float64_rounds_much(device, far, size, line
     """Small faces far from the origin, or from their frames, in fractions: rounding alone moves what they meet by."""
     rng = np.random.default_rng(3)
     cases, ends, truths = [], [], []
-    for k in range(60):
+    for k in range(24):
         a, b = (size * (rng.normal(size=(1, 1, 3)) + rng.normal(size=(2, 3, 3))) for _ in range(2))
         off = far * rng.normal(size=(2, 3)) * (k % 2)
         models = [ab.Model.from_arrays((s + x).reshape(-1, 3), np.arange(6).reshape(-1, 3), base_faces=2)
@@ -158,7 +158,7 @@ def test_contacts_are_not_late_where_float64_rounds_much(device, far, size, line
     result = find(device, cases, np.array(ends), tolerance=2.0**-40, linear=linear)
     met = scene_of(device, cases).intersect(pairs_of(cases)).any
     touching = [truth is not None for truth in truths]
-    assert sum(touching) > 15
+    assert sum(touching) > 5
     for truth, hit, time, clear in zip(truths, met, result.time.tolist(), result.clear, strict=True):
         if not hit and truth is not None:
             assert not clear and Fraction(time) <= truth

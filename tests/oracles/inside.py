@@ -4,7 +4,7 @@ import random
 
 import numpy as np
 
-from oracles.triangle import brute_force_faces, clip, cross, dot, integer_points, into_frame_of_a, sub
+from oracles.triangle import brute_force_faces, clip, cross, dot, integer_points, into_frame_of_a
 
 
 def parity(point, triangles):
@@ -19,25 +19,21 @@ def winding_number(point, triangles):
     which side of the point. A direction for which any of the three is 0 is not in general position: another is tried.
     """
     flat, origin = integer_points(np.reshape(triangles, (-1, 3)), np.reshape(point, (1, 3)))
-    corners = [sub(p, origin[0]) for p in flat]
+    corners = np.array(flat, object).reshape(-1, 3, 3) - np.array(origin, object)
+    a, b, c = corners.transpose(1, 2, 0)
+    volume = dot(a, cross(b, c))
+    # A line in general position passes the plane of a face where the point is in it, or its line, in the point alone.
+    assert not any(clip(face, [(0, 0, 0)] * 3) for face in corners[volume == 0].tolist()), "it is on the surface"
+    normals = [np.stack(cross(u, v))[:, volume != 0] for u, v in ((a, b), (b, c), (c, a))]
     rng = random.Random(0)
     while True:
         direction = tuple(rng.randint(-(10**6), 10**6) for _ in range(3))
-        crossings = 0
-        for k in range(0, len(corners), 3):
-            a, b, c = corners[k : k + 3]
-            volume = dot(a, cross(b, c))
-            if volume == 0:
-                # A line in general position passes the plane of the face, or its line, in the point alone.
-                assert not clip((a, b, c), [(0, 0, 0)] * 3), "the point lies on the surface"
-                continue
-            sides = [dot(direction, cross(u, v)) for u, v in ((a, b), (b, c), (c, a))]
-            if 0 in sides:
-                break
-            if (min(sides) > 0 or max(sides) < 0) and volume * sides[0] > 0:
-                crossings += 1 if sides[0] > 0 else -1  # out of the face's side that is wound about it, or in
-        else:
-            return crossings
+        sides = np.array([dot(direction, normal) for normal in normals])
+        if (sides == 0).any():
+            continue
+        passed = ((sides > 0).all(0) | (sides < 0).all(0)) & (volume[volume != 0] * sides[0] > 0)
+        # Out of a face's side that is wound about it, or in.
+        return int(np.where(sides[0] > 0, 1, -1)[passed].sum())
 
 
 def components(faces):

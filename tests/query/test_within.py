@@ -47,7 +47,7 @@ def test_single_faces_equal_brute_force(device, kind):
     """All ways in which two triangles can be closest, parallel ones and faces without area too."""
     rng = np.random.default_rng(2)
     cases = []
-    for _ in range(200):
+    for _ in range(70):
         a, b = rng.normal(size=(2, 3, 3))
         b += rng.normal(size=3) * 2
         if kind == "flat":
@@ -71,7 +71,7 @@ def test_single_faces_equal_brute_force(device, kind):
         cases.append((a, 0, STILL, b, 0, STILL))
     scene = scene_of(device, cases)
     distances = distances_of(scene, cases)
-    assert (distances > 0).sum() > 100
+    assert (distances > 0).sum() > 35
     check_distances(scene, pairs_of(cases), distances)
 
 

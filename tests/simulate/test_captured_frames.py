@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import warp as wp
+from conftest import slow_rows
 from helpers import refused
 from helpers.bodies import BALL, BRICK, TORUS, bits, on_ground, ring_and_ball, selection_models
 from helpers.faults import Interruption
@@ -90,8 +91,12 @@ def describe(frame, state, result):
     return row, found, [array.tobytes() for array in state()]
 
 
-@pytest.mark.parametrize("kind", CONTROLLERS)
-@pytest.mark.parametrize("output", ["any", "faces", "contacts", "bodies"])
+FEW = [(kind, output) for kind in CONTROLLERS for output in ("faces", "bodies")]
+FEW += [(kind, output) for kind in ("finest", "predictive") for output in ("any", "contacts")]
+MORE = [(kind, output) for kind in CONTROLLERS for output in ("any", "contacts")]
+
+
+@pytest.mark.parametrize(("kind", "output"), [*FEW, *slow_rows(*(row for row in MORE if row not in FEW))])
 def test_captured_frames_are_launched_ones(device, kind, output):
     frames = [make_frame(device, kind, output, captured) for captured in (True, False)]
     seen, lods = [], set()

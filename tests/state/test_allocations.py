@@ -54,7 +54,10 @@ class Allocations:
 
 @pytest.fixture
 def allocations(device, monkeypatch):
-    return Allocations(device, monkeypatch)
+    gc.collect()
+    gc.freeze()  # what other tests hold: collections are short
+    yield Allocations(device, monkeypatch)
+    gc.unfreeze()
 
 
 def make_scene(device, count=40, fractions=(1.0,), names=("ball",)):

@@ -241,7 +241,7 @@ def test_a_real_interruption():
     scene = scenes.add_objects("cpu", ["torus"] * 60, seed=6, spread=0.5)
     expected = scene.intersect(output="count").count
     main = threading.main_thread().ident
-    for delay in np.linspace(0.001, 0.05, 12):
+    for delay in np.linspace(0.001, 0.05, 6):
         timer = threading.Timer(delay, signal.pthread_kill, (main, signal.SIGINT))
         try:
             timer.start()

@@ -28,9 +28,9 @@ def make_kernel(snippet):
     return write_kernel
 
 
-def make_kernels(number, code="x.data[0] = {};"):
+def make_kernels(number, code="x.data[0] = {};", count=4):
     """Return kernels that are new to this process, and their block sizes."""
-    return [(make_kernel(code.format(100 * number + i)), 32) for i in range(4)]
+    return [(make_kernel(code.format(100 * number + i)), 32) for i in range(count)]
 
 
 def loads_of(monkeypatch, cores):
@@ -62,14 +62,14 @@ def test_one_core_waits_for_the_launches(device, monkeypatch):
 
 def test_an_error_ends_it_and_is_said_again(device, monkeypatch):
     """Of the work beside first, then of the compiler."""
-    loaded, device, kernels = loads_of(monkeypatch, 2), wp.get_device(device), make_kernels(3, "no code {};")
+    loaded, device, kernels = loads_of(monkeypatch, 2), wp.get_device(device), make_kernels(3, "no code {};", 1)
     with pytest.raises(KeyError, match="beside"), kernel_loading.loading(device, kernels):
         raise KeyError("beside")
     for _ in range(2):
         loaded.clear()
         with pytest.raises(Exception, match="build failed"), kernel_loading.loading(device, kernels):
-            pass
-        assert loaded
+            while not loaded:  # so that the other thread is told
+                time.sleep(0.001)
 
 
 def compile_ahead(monkeypatch, device, cores, kernels, number):
@@ -122,7 +122,7 @@ def test_the_end_of_a_build_waits_for_what_has_begun_and_compiles_meanwhile(monk
 
 
 def test_an_error_ahead_is_said_by_the_launch(device, monkeypatch):
-    kernels = make_kernels(4, "no code {};")
+    kernels = make_kernels(4, "no code {};", 1)
     compile_ahead(monkeypatch, device, 4, kernels, 0)
     with pytest.raises(Exception, match="build failed"), kernel_loading.loading(wp.get_device(device), kernels):
         pass
