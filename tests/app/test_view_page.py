@@ -12,7 +12,8 @@ import numpy as np
 import PIL.Image
 import pytest
 from helpers import refused
-from helpers.viewer import make_models, make_playback, place, run_command, write_scene
+from helpers.viewer import make_models, make_playback, run_command, write_scene
+from oracles.motion import posed
 
 import warp_abtree as ab
 
@@ -236,7 +237,7 @@ def test_a_model_of_one_lod_has_nothing_to_choose(server, device):
     assert page._mode.disabled and page._all_lod.disabled
     # The grid lies across up, below the scene.
     turn = page._grid.wxyz[[1, 2, 3, 0]]
-    assert np.allclose(place((0, 0, 0, *turn), (0, 0, 1)), np.array([1, 2, 3]) / 14**0.5)
+    assert np.allclose(posed([(0, 0, 1)], (0, 0, 0, *turn))[0], np.array([1, 2, 3]) / 14**0.5)
     assert page._grid.position @ (1, 2, 3) < 1
 
 
@@ -251,7 +252,7 @@ def test_the_first_camera_sees_all_in_windows_of_any_shape(server, device, monke
     reach = np.tan(0.5 * server.initial_camera.fov)
     for i, pose in enumerate(scene.poses):
         vertices = scene.models[scene.object_model[i]].mesh_at(int(scene.lods[i]))[0]
-        x, y, z = camera.view @ (place(pose, vertices) - camera.eye).T
+        x, y, z = camera.view @ (posed(vertices, pose) - camera.eye).T
         assert (z < 0).all() and (np.abs(x / z) < aspect * reach).all() and (np.abs(y / z) < reach).all()
 
 

@@ -5,7 +5,8 @@ import PIL.Image
 import pytest
 import trimesh
 from helpers import refused
-from helpers.viewer import BODIES, make_models, make_playback, place, write_scene
+from helpers.viewer import BODIES, make_models, make_playback, write_scene
+from oracles.motion import posed
 
 import warp_abtree as ab
 from warp_abtree.app import load_scene, picture
@@ -143,7 +144,7 @@ def test_boxes_of_a_level_are_those_of_the_faces_below(device, i, lod, level):
             expected.append((corners.min(axis=0), corners.max(axis=0)))
     assert edges.shape == (12 * len(expected), 2, 3) and (len(expected) > 0) == (level < 11)
     # Back to the model's frame, where edges lie along the axes.
-    turn = place(np.append([0, 0, 0], snapshot.poses[i, 3:]), np.eye(3)).T
+    turn = posed(np.eye(3), np.append([0, 0, 0], snapshot.poses[i, 3:])).T
     for corners, (lower, upper) in zip((edges - snapshot.poses[i, :3]).reshape(-1, 24, 3) @ turn, expected):
         assert np.allclose([corners.min(axis=0), corners.max(axis=0)], [lower, upper], atol=1e-6)
         length = np.abs(corners[::2] - corners[1::2])
