@@ -84,11 +84,11 @@ class ObjectList:
             hole = Model.from_arrays(np.eye(3) * edge, np.array([[0, 1, 2]]), name="removed")
         if id(hole) not in self.place:
             models.append(hole)
-        left = {"model": self.place.get(id(hole), len(self.models)), "lod": 0, "importance": 1, "static": True}
-        left |= {"solid": False, "group": 0, "mask": 0, "name": "removed"}
+        left: dict[str, Any] = {"name": "removed", "model": self.place.get(id(hole), len(self.models)), "lod": 0}
+        left |= {"importance": 1, "static": True, "solid": False, "group": 0, "mask": 0}
         lists = self._written(places, {name: [value] * len(places) for name, value in left.items()})
-        lists |= {"hole": hole, "free": sorted([*self.free, *places])}
-        vars(self).update(lists | _without_unused(models, lists["model"]))
+        lists |= _without_unused(models, lists["model"])
+        vars(self).update(lists, hole=hole, free=sorted([*self.free, *places]))
 
     def _written(self, places: list[int], columns: dict[str, list]) -> dict[str, list]:
         """Return copies of lists, by name, with other values at some places: one step puts them all in place."""
