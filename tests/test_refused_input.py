@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+import trimesh
 from helpers import refused
 from helpers.questions import in_a_row
 from helpers.samples import SHAPES, SHUTTLE_SCENE, STILL, sample
@@ -103,6 +104,8 @@ REFUSED = [
     *refuse_options(swept, "signed originals", "distance", NO_FLAG),
     *refuse_options(swept, "screw linear", "first_contact", NO_FLAG),
     *refuse("^end_poses: ", lambda x: swept(output="first_contact", end_poses=x), False, "x"),
+    *refuse("^orient ", lambda x: ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], orient=x), *NO_FLAG, None),
+    *refuse("^solid .*'closed'", lambda x: ab.scene_from_trimesh(trimesh.Scene(), solid=x), *NO_FLAG, None),
     *refuse("friction", lambda x: ab.Dynamics(balls(count=1), friction=x), np.inf),
     *refuse(
         "base_faces", lambda x: ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], base_faces=x), 1.5, np.inf, "ten", True
