@@ -96,8 +96,8 @@ class Model:
             ValueError: base_faces is below 1, or orient no bool.
         """
         base_faces = whole_number(base_faces, "base_faces", 1, 2**62)
-        orient, options = flag(orient, "orient"), (FORMAT_VERSION, base_faces)
-        options = (*options, "oriented by parity") if orient else options
+        oriented = ("oriented by parity",) if flag(orient, "orient") else ()
+        options = (FORMAT_VERSION, base_faces, *oriented)
         key = file_key(source, *options) if cache else None
         model = find_model(key, partial(_read, error_key=error_key(key)))
         if model is not None:
