@@ -328,6 +328,27 @@ def test_worlds_alone_and_together_are_the_same(device, kind, moved):
         assert run_worlds(device, (world,), kind, moved)[world] == found[world]
 
 
+SCENE_EDITS = {
+    "add": lambda scene: scene.add(sample("box")),
+    "change": lambda scene: scene.change(2, importance=3),
+    "remove": lambda scene: scene.remove(1),
+    "another model": lambda scene: (scene.remove(1), scene.add(sample("box"))),
+}
+
+
+@pytest.mark.parametrize("edit", SCENE_EDITS)
+def test_a_controller_is_of_the_scene_that_it_was_made_for(device, edit):
+    """Whatever its objects and models are now: it says so, and another one goes on in its place."""
+    scene = scene_with(device, *[(sample("ball"), (1.2 * i, 0, 0, 0, 0, 0, 1)) for i in range(3)])
+    frame = ab.Frame(scene, lods=ab.ToleranceController(scene, 0.1), output="count")
+    frame.step()
+    SCENE_EDITS[edit](scene)
+    for _ in range(2):
+        refused(RuntimeError, "since this selection was made; make a new one", frame.step)
+    frame.lods = ab.ToleranceController(scene, 0.1)
+    assert np.array_equal(frame.step().pairs, scene.broad_phase())
+
+
 def test_a_scene_or_motion_of_others(device):
     """Frames go on where objects were added; a motion of other objects is refused."""
     scene, others = (ab.Scene(device) for _ in range(2))

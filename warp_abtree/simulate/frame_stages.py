@@ -85,6 +85,7 @@ class FrameStages:
 
     def _serve(self, controller):
         """Let objects stand at the levels of a controller's ladder."""
+        controller.view.check()  # its ladder is of the models that the scene had
         ladder = controller.ladder.levels()
         shared = shares_levels(self.batch.object_model, ladder)
         self._levels = made = LevelStates(self.batch, ladder, self.batch.lods, shared)
