@@ -91,7 +91,7 @@ class FrameStages:
         self._levels = made = LevelStates(self.batch, ladder, self.batch.lods, shared)
         made.wanted = controller.lods
         self.batch.follow(made)
-        self.table = LodColumns(self.scene.models, made.level_model, made.level_lod)
+        self.table = LodColumns(self.scene, made.level_model, made.level_lod)
         self._count, self._changed = made.levels.count, made.levels.changed
         if made.plan is not None:
             self._marked = made.plan.marked_count
