@@ -5,9 +5,10 @@ import re
 
 import numpy as np
 import pytest
+import trimesh
 from helpers import refused
 from helpers.questions import in_a_row
-from helpers.samples import SHAPES, SHUTTLE_SCENE, sample
+from helpers.samples import SHAPES, SHUTTLE_SCENE, STILL, sample
 from helpers.viewer import write_scene
 
 import warp_abtree as ab
@@ -57,6 +58,25 @@ def refuse(name, make, *values):
     yield from ((name, lambda value=value: make(value)) for value in values)
 
 
+def in_scene(output="any", **options):
+    scene = balls()
+    if output == "first_contact":
+        return scene.first_contact([(0, 1)], scene.poses, **options)
+    return scene.intersect([(0, 1)], output, **options)
+
+
+def swept(output="any", **options):
+    model, ends = balls().models[0], {"end_poses": [STILL]} if output == "first_contact" else {}
+    return ab.sweep(model, model, [STILL], output=output, device="cpu", **{**ends, **options})
+
+
+def refuse_options(ask, names, output, values):
+    """Yield calls with a bad value of each of some options."""
+    for name in names.split():
+        yield from refuse(f"^{name}\\b", lambda x, name=name: ask(output, **{name: x}), *values)
+
+
+NO_NUMBER, NO_FLAG = (False, True, "x", np.nan), (0, 1, "x", [True])
 BAD_NUMBERS = ("8", None, np.nan, -1.0, [8.0])
 REFUSED = [
     *refuse("time_step", lambda x: ab.Frame(balls(), time_step=x), 0, np.nan, "x"),
@@ -73,6 +93,19 @@ REFUSED = [
     *refuse(r"^threshold_ms\b", lambda x: ab.PaperController(balls(), 8.0, threshold_ms=x), "8", np.nan, -1.0),
     *refuse("^device 'cpu'", lambda x: balls().intersect(device=x), "cpu"),
     *refuse("^device 'cpu'", lambda x: balls().first_contact(None, np.eye(4)[None].repeat(2, 0), device=x), "cpu"),
+    *refuse("^output ", in_scene, ["any"], 1, None),
+    *refuse("^output ", swept, ["any"], 1, None),
+    *refuse_options(in_scene, "within gap", "contacts", NO_NUMBER),
+    *refuse_options(in_scene, "tolerance relative beyond", "distance", NO_NUMBER),
+    *refuse_options(in_scene, "signed originals", "distance", NO_FLAG),
+    *refuse_options(in_scene, "screw linear", "first_contact", NO_FLAG),
+    *refuse_options(swept, "within", "any", NO_NUMBER),
+    *refuse_options(swept, "tolerance relative beyond", "distance", NO_NUMBER),
+    *refuse_options(swept, "signed originals", "distance", NO_FLAG),
+    *refuse_options(swept, "screw linear", "first_contact", NO_FLAG),
+    *refuse("^end_poses: ", lambda x: swept(output="first_contact", end_poses=x), False, "x"),
+    *refuse("^orient ", lambda x: ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], orient=x), *NO_FLAG, None),
+    *refuse("^solid .*'closed'", lambda x: ab.scene_from_trimesh(trimesh.Scene(), solid=x), *NO_FLAG, None),
     *refuse("friction", lambda x: ab.Dynamics(balls(count=1), friction=x), np.inf),
     *refuse(
         "base_faces", lambda x: ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], base_faces=x), 1.5, np.inf, "ten", True

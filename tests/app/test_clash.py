@@ -11,7 +11,7 @@ from helpers.viewer import run_command as run
 from trimesh.transformations import rotation_matrix, translation_matrix
 
 import warp_abtree as ab
-from warp_abtree.app.cli.clash_command import CLASH_KINDS, find_clashes
+from warp_abtree.app.cli.clash_command import CLASH_KINDS, assembly_size, find_clashes
 
 PLATE = trimesh.creation.annulus(5, 30, 10, sections=64)  # its hole of radius 5 is along z
 CUBE = trimesh.creation.box((10, 10, 10))
@@ -108,6 +108,15 @@ def test_order_and_tolerance(device):
     assert ("block", "lid") in {(c.first, c.second) for c in find_clashes(scene, tolerance=0.5)}
     for name, value in (("within", -1), ("within", np.nan), ("tolerance", np.inf)):
         refused(ValueError, f"{name}: .* is no distance of 0 or more", find_clashes, scene, **{name: value})
+
+
+def test_what_was_removed_counts_for_nothing(device):
+    """Not for the size of the assembly, of which the tolerance is a part."""
+    scene = scene_of(device, {"plate": (PLATE, 0, 0, 4), "far": (CUBE, 1e9, 0, 0), "pin": (pin(5.02),)})
+    scene.remove(1)
+    assert assembly_size(scene) == assembly_size(scene_of(device, {"plate": (PLATE, 0, 0, 4), "pin": (pin(5.02),)}))
+    (found,) = find_clashes(scene)
+    assert (found.kind, found.pair) == ("interference", (0, 2))
 
 
 def test_balls_have_the_kinds_and_distances_of_fcl(device):

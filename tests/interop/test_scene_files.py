@@ -370,6 +370,19 @@ def test_plain_scene_out_and_in(tmp_path):
     refused(ValueError, "the scene has 1", ab.to_trimesh, small, scene.intersect([[2, 3]]))
 
 
+def test_no_name_is_the_frame_of_all(device):
+    """An object may be called as trimesh calls the frame of the scene, and a removed one leaves its name to others."""
+    scene = scene_with(device, *[(ab.Model.load(BOX), (k, 0, 0, 0, 0, 0, 1), {"name": "removed"}) for k in range(3)])
+    scene.add(ab.Model.load(BOX), (5, 2, 0, 0, 0, 0, 1), name="world")
+    scene.remove(0)
+    given = ab.to_trimesh(scene, names=["world", "a", "b", "world_1"])
+    for out, names in (ab.to_trimesh(scene), ["removed", "removed_1", "world"]), (given, ["a", "b", "world_1"]):
+        assert list(out.graph.nodes_geometry) == names
+        assert [out.graph[name][0][:3, 3].tolist() for name in names] == [[1, 0, 0], [2, 0, 0], [5, 2, 0]]
+        back = ab.scene_from_trimesh(out, device)
+        assert back.poses[:, :3].tolist() == [[1, 0, 0], [2, 0, 0], [5, 2, 0]]
+
+
 def test_one_world_out():
     scene = scene_with("cpu", *[(ab.Model.load(BOX), np.eye(4), {"world": world}) for world in (-1, 0, 1, 1)])
     assert sorted(ab.to_trimesh(scene, world=1).graph.nodes_geometry) == ["trimesh 0", "trimesh 2", "trimesh 3"]

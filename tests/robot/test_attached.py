@@ -114,6 +114,28 @@ def test_an_arm_holds_a_cup_in_a_shelf(arm, shelf, touches):
     assert arm.attached == () and asked_pairs(arm) == alone and arm.link_names[-1] == "flap"
 
 
+def test_the_world_goes_by_its_names_of_now(arm, shelf):
+    """Also where a place has no object any more, and of arrays that are kept."""
+    rows = random_configurations(60, seed=4)
+    told = arm.check(rows, shelf, which=True)
+    shelf.change(2, name="hoop")
+    as_hoop = [sorted((a, b.replace("trimesh 2", "hoop")) for a, b in row) for row in told]
+    assert [sorted(row) for row in arm.check(rows, shelf, which=True)] == as_hoop != [sorted(row) for row in told]
+    near = arm.check(rows, shelf, output="distance")
+    shelf.change(2, name="a ring of steel")
+    nearer = arm.check(rows, shelf, output="distance")
+    assert np.array_equal(np.where(near["names"] == "hoop", "a ring of steel", near["names"]), nearer["names"])
+    assert "a ring of steel" in nearer["names"]
+    shelf.remove(0)
+    assert arm.check(rows, shelf, which=True) == [
+        sorted((a, b.replace("hoop", "a ring of steel")) for a, b in row if b != "board 0") for row in as_hoop
+    ]
+    shelf.remove([1, 2])
+    np.testing.assert_array_equal(
+        arm.check(rows, shelf, output="distance")["names"], arm.check(rows, output="distance")["names"]
+    )
+
+
 def test_an_edge_is_blocked_by_what_is_held(device):
     """A cube slides along x by 1; a rod of 0.5 that it holds ahead meets a wall 0.8 away."""
     mesh, wall = trimesh.creation.box((0.1, 0.1, 0.1)), ab.Model.load(trimesh.creation.box((0.1, 1, 1)))

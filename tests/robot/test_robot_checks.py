@@ -201,7 +201,7 @@ def test_a_query_is_captured_and_says_when_room_was_short(arm, device, monkeypat
         (np.zeros((3, 3)), r"shape \(3, 3\), not \(c, 4\)"),
         (np.zeros(3), r"shape \(3,\), not \(c, 4\) or \(4,\)"),
         (np.float64(0.0), r"shape \(\)"),
-        ([[0, 0, 0, 0], [0, np.nan, 0, 0]], "configuration 1 has nan for joint 'bend'"),
+        ([[0, 0, 0, 0], [0, np.nan, 0, 0]], "configuration 1 has nan for joint 'bend', no finite number"),
         ([[0, 0, 0, 0], [0, 3, 0, 0]], "configuration 1 has 3 for joint 'bend', outside -2.8 .. 2.8"),
         ("x", "configurations"),
     ],
@@ -306,6 +306,7 @@ def test_bad_options_are_refused(arm, device):
         (lambda: arm.check_edges(rows, rows, tolerance=0), ValueError, "tolerance"),
         (lambda: ab.Robot(described_arm(), device, mounted=["foot"]), ValueError, "no link 'foot'"),
         (lambda: ab.Robot(described_arm(), device, mounted="base"), TypeError, "'base' is a name"),
+        (lambda: ab.Robot(described_arm(), device, mounted=None), TypeError, "mounted: None is a NoneType"),
     ):
         refused(error, message, call)
     assert arm.check(np.empty((0, 4))).shape == (0,) and len(arm.check_edges(rows[:0], rows[:0])) == 0

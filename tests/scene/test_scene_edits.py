@@ -1,12 +1,15 @@
 """Editing a scene: names, poses of one object, objects removed and changed; what is left is a scene made anew."""
 
 import csv
+import sys
 
 import numpy as np
 import pytest
+import trimesh
+from conftest import slow
 from helpers import refused
 from helpers.samples import STILL, random_poses, sample
-from helpers.scenes import TURN, everything, pair_scene
+from helpers.scenes import TURN, everything, pair_scene, scene_with
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -112,11 +115,86 @@ def test_what_is_removed_is_nowhere(device):
         refused(ValueError, "object 1.* removed", call, *arguments)
     refused(ValueError, "twice", scene.remove, [0, 0])
     refused(ValueError, "outside 0 .. 2", scene.remove, [0, 3])
+    query = ab.Query(scene, "any", pairs=[(0, 2)])
+    scene.remove([])
+    query.launch()
+    # Of a place without an object any LOD is one, in scenes and frames.
+    scene.set_lods([30, 10**6, 12])
+    ab.Frame(scene, lods=lambda _: np.array([30, -1, 12])).step()
     assert everything(scene) == before
     assert list(ab.to_trimesh(scene).graph.nodes_geometry) == ["small ball 0", "small ball 2"]
     # The filter of objects 0 and 1 went with object 1.
     assert scene.add(sample("box"), (0.5, 0.25, 0, 0, 0, 0, 1)) == 1
     assert [0, 1] in scene.broad_phase().tolist()
+
+
+@pytest.mark.parametrize("exponent", [-99, 0, 99])
+def test_objects_of_any_size_can_be_removed(device, exponent):
+    mesh = trimesh.creation.box()
+    model = ab.Model.from_arrays(np.ldexp(mesh.vertices, exponent), mesh.faces)
+    scene = scene_with(device, model, model, model)
+    scene.remove(1)
+    assert scene.broad_phase().tolist() == [[0, 2]] and scene.intersect().any.all()
+
+
+EDITS = {
+    "add": lambda scene: scene.add(sample("twins"), STILL, name="new"),
+    "append": lambda scene: scene.add_many(sample("twins"), [STILL] * 3),
+    "remove": lambda scene: scene.remove([0, 2]),
+    "change": lambda scene: scene.change(0, world=1, static=True, name="other"),
+}
+
+
+@pytest.mark.parametrize("edit", ["add", "remove", *slow("append", "change")])
+def test_an_edit_is_made_wholly_or_not_at_all(device, edit):
+    """Whichever line of it an interruption comes before."""
+
+    def make():
+        scene = pair_scene(device)
+        scene.remove(1)
+        scene.add(sample("torus"), (0.2, 0, 0, 0, 0, 0, 1))
+        scene.remove(scene.add(sample("box")))
+        scene.filter([(0, 2)])
+        scene.intersect()
+        return scene
+
+    def held(scene):
+        names = [scene.name(i) for i in np.flatnonzero(scene.present)]
+        # The other questions first: they have to take what an interruption left.
+        return scene.intersect().pairs.tolist(), names, scene.present.tolist(), len(scene.models), everything(scene)
+
+    def interrupt(left):
+        scene, lines = make(), set()
+
+        def trace(frame, event, _):
+            if not frame.f_code.co_filename.endswith(("objects.py", "batch.py", "generation.py")):
+                return None
+            if event == "line":
+                lines.add((frame.f_code, frame.f_lineno))
+                if len(lines) > left:
+                    sys.settrace(None)
+                    raise KeyboardInterrupt
+            return trace
+
+        try:
+            sys.settrace(trace)
+            EDITS[edit](scene)
+            return scene, True
+        except KeyboardInterrupt:
+            return scene, False
+        finally:
+            sys.settrace(None)
+
+    before, after = make(), make()
+    EDITS[edit](after)
+    allowed = held(before), held(after)
+    assert allowed[0] != allowed[1]
+    for left in range(1000):
+        scene, done = interrupt(left)
+        assert held(scene) in allowed[done:]
+        if done:
+            break
+    assert left > 20
 
 
 def test_a_scene_may_lose_all_objects(device):
@@ -143,6 +221,8 @@ def test_changes_are_those_of_add_and_leave_the_rest(device):
     refused(ValueError, "name", scene.change, 0, name="")
     refused(ValueError, "name", scene.add, sample("box"), name=7)
     refused(ValueError, "names: 1 given for 2", scene.add_many, sample("box"), [STILL] * 2, names=["a"])
+    for names in ("ab", 5):
+        refused(ValueError, f"names: {names!r} is no list", scene.add_many, sample("box"), [STILL] * 2, names=names)
     assert everything(scene) == before and scene.object_importance == [1, 3, 1, 1]
     # A new name leaves queries as they are.
     query = ab.Query(scene, "any", pairs=[(0, 1)])
@@ -175,4 +255,9 @@ def test_results_are_rows_with_names(device, tmp_path):
         if output == "contacts":
             point = [[float(row[f"point_{axis}"]) for axis in "xyz"] for row in table]
             np.testing.assert_array_equal(point, first.pair_contacts["point"])
-    assert scene.intersect([], "any").rows() == []
+        # Without a pair too, the table has these columns.
+        none = ask([], scene.poses if output == "first_contact" else output, device=output == "any")
+        none.to_csv(tmp_path / "none.csv")
+        assert none.rows() == []
+        with open(tmp_path / "none.csv", newline="", encoding="utf-8") as file:
+            assert list(csv.reader(file)) == [list(table[0])]

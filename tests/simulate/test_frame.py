@@ -328,6 +328,46 @@ def test_worlds_alone_and_together_are_the_same(device, kind, moved):
         assert run_worlds(device, (world,), kind, moved)[world] == found[world]
 
 
+@pytest.mark.parametrize("controller", [None, "tolerance"])
+def test_rows_are_of_the_objects_that_are_there(device, controller):
+    """Where others were removed, and where all were."""
+    rows = []
+    for removed in ([], [1, 3]):
+        places = [(sample("ball"), (1.2 * i, 0, 0, 0, 0, 0, 1)) for i in range(3)]
+        for i in removed:
+            places.insert(i, (sample("box"),))
+        scene = scene_with(device, *places)
+        scene.remove(removed)
+        frame = ab.Frame(scene, lods=controller and ab.ToleranceController(scene, 0.1), output="count")
+        frame.run(2)
+        rows.append([{**row.as_dict(), **dict.fromkeys([*STAGES, "total_ms"])} for row in frame.history])
+    assert rows[0] == rows[1] and rows[0][-1]["objects"] == 3
+    assert (rows[0][-1]["error_mean"] > 0) == bool(controller)
+    scene.remove(np.flatnonzero(scene.present))
+    ab.Frame(scene).run(1)
+
+
+SCENE_EDITS = {
+    "add": lambda scene: scene.add(sample("box")),
+    "change": lambda scene: scene.change(2, importance=3),
+    "remove": lambda scene: scene.remove(1),
+    "another model": lambda scene: (scene.remove(1), scene.add(sample("box"))),
+}
+
+
+@pytest.mark.parametrize("edit", SCENE_EDITS)
+def test_a_controller_is_of_the_scene_that_it_was_made_for(device, edit):
+    """Whatever its objects and models are now: it says so, and another one goes on in its place."""
+    scene = scene_with(device, *[(sample("ball"), (1.2 * i, 0, 0, 0, 0, 0, 1)) for i in range(3)])
+    frame = ab.Frame(scene, lods=ab.ToleranceController(scene, 0.1), output="count")
+    frame.step()
+    SCENE_EDITS[edit](scene)
+    for _ in range(2):
+        refused(RuntimeError, "since this selection was made; make a new one", frame.step)
+    frame.lods = ab.ToleranceController(scene, 0.1)
+    assert np.array_equal(frame.step().pairs, scene.broad_phase())
+
+
 def test_a_scene_or_motion_of_others(device):
     """Frames go on where objects were added; a motion of other objects is refused."""
     scene, others = (ab.Scene(device) for _ in range(2))

@@ -107,28 +107,38 @@ def test_first_use(device, fault):
     assert fault.everywhere(lambda: add_objects(device), lambda s: s.intersect(PAIRS, output="faces"), check)[0] > 30
 
 
+EDITS = {
+    "add": (lambda scene: scene.add(sample("box"), lod=3), lambda scene: [*scene.lods[5:]] == [3]),
+    "remove": (lambda scene: scene.remove(4), lambda scene: not scene.present[4]),
+    "change": (lambda scene: scene.change(4, world=1), lambda scene: scene.worlds[4] == 1),
+}
+
+
 @pytest.mark.slow
-def test_a_new_object(device, fault):
-    """It is there, or not; poses and LODs of the others stay where they were set, not where they were added."""
+@pytest.mark.parametrize("edit", EDITS)
+def test_an_edit(device, fault, edit):
+    """It is made, or not; poses and LODs of the others stay where they were set, not where they were added."""
+    change, is_made = EDITS[edit]
 
     def make():
         scene = make_scene(device)
-        scene.set_poses(random_poses(np.random.default_rng(2), 4, 0.5))
+        scene.add(sample("twins"))
+        scene.set_poses(random_poses(np.random.default_rng(2), 5, 0.5))
         return scene, describe(scene.intersect(PAIRS, output="faces"))
 
-    def add(made):
-        if made[0].object_count == 4:
-            made[0].add(sample("box"), lod=3)
-        return made[0].intersect([(4, 0), *PAIRS], output="faces")
+    def call(made):
+        if not is_made(made[0]):
+            change(made[0])
+        return made[0].intersect(output="faces")
 
     def check(before, made):
         scene, answers = made
         if before is not None:
-            assert scene.object_count in (4, 5) and [*scene.lods[4:]] in ([], [3])
+            assert scene.object_count == 5 or is_made(scene)
             assert describe(scene.intersect(PAIRS, output="faces")) == answers
         return True
 
-    assert fault.everywhere(make, add, check)[0] > 30
+    assert fault.everywhere(make, call, check)[0] > 30
 
 
 def test_pairs_are_filtered_out(device, monkeypatch):

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.checks.arguments import flag
 from warp_abtree.interop.usd import read_usd
 from warp_abtree.model.files.found import FileSurface, Remarks
 from warp_abtree.model.files.read import USD, read_file, split_file_name
@@ -51,7 +50,9 @@ def scene_from_trimesh(source, device=None, base_faces=10, progress=None, solid=
 
     if not isinstance(source, trimesh.Scene):
         raise TypeError(f"source is a {type(source).__name__}, not a trimesh.Scene")
-    every = solid != "closed" and flag(solid, "solid")
+    if solid != "closed" and not isinstance(solid, bool | np.bool_):
+        raise ValueError(f"solid {solid!r} is neither True nor False nor 'closed'")
+    every = solid != "closed" and bool(solid)
     keys = {name: _mesh_hash(mesh) for name, mesh in source.geometry.items() if isinstance(mesh, trimesh.Trimesh)}
     placed = []
     for node in source.graph.nodes_geometry:
@@ -179,9 +180,11 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
     """
     import trimesh
 
-    count = scene.object_count
+    count, present = scene.object_count, np.flatnonzero(scene.present).tolist()
     if names is None:
-        names = _distinct(scene.name(i) if there else "removed" for i, there in enumerate(scene.present))
+        # Places without an object come last: they have no node, and must not change the names of others.
+        names = _distinct([*map(scene.name, present), *["removed"] * (count - len(present))])
+        names = np.array(names, object)[np.argsort(np.argsort(~scene.present, kind="stable"))]
     names = list(names)
     if len(names) != count or len(set(names)) != count or not all(isinstance(name, str) for name in names):
         raise ValueError(f"names: not {count} different strings")
@@ -190,8 +193,9 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
     hit = {} if result is None else _intersecting_faces(result)
     objects = scene.batch().objects.pool
     worlds, rotation, position = objects.world.numpy(), objects.rotation.numpy(), objects.position.numpy()
-    made = trimesh.Scene()
-    for i in np.flatnonzero(scene.present).tolist():
+    # The frame of all others is no object's.
+    made = trimesh.Scene(base_frame=_distinct([*names, "world"])[-1])
+    for i in present:
         if world is not None and worlds[i] not in (world, -1):
             continue
         model, lod = scene.models[scene.object_model[i]], int(scene.lods[i])

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line, whole_number
+from warp_abtree.checks.arguments import first_line, flag, whole_number
 from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.kernels.base.poses import COORDINATE_MIN
 from warp_abtree.model.cache import LEAST_FACES, error_key, file_key, find_model, keep_errors, keep_model, mesh_key
@@ -93,10 +93,11 @@ class Model:
 
         Raises:
             MeshError: The mesh is missing, unreadable, empty or invalid.
-            ValueError: base_faces is below 1.
+            ValueError: base_faces is below 1, or orient no bool.
         """
         base_faces = whole_number(base_faces, "base_faces", 1, 2**62)
-        options = (FORMAT_VERSION, base_faces, "oriented by parity") if orient else (FORMAT_VERSION, base_faces)
+        oriented = ("oriented by parity",) if flag(orient, "orient") else ()
+        options = (FORMAT_VERSION, base_faces, *oriented)
         key = file_key(source, *options) if cache else None
         model = find_model(key, partial(_read, error_key=error_key(key)))
         if model is not None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warp_abtree.checks.arguments import to_numpy, whole_number
+from warp_abtree.checks.arguments import flag, to_numpy, whole_number
 from warp_abtree.kernels.exact import predicates
 from warp_abtree.kernels.intersect import face_pairs
 
@@ -18,6 +18,8 @@ _HITS, _DISTANCE = ("within",), ("tolerance", "relative", "beyond", "signed", "o
 SCENE_OPTIONS = {"any": _HITS, "count": _HITS, "faces": _HITS, "contacts": ("within", "gap"), "distance": _DISTANCE}
 _SWEPT = {"any": _HITS, "count": _HITS, "faces": (), "distance": _DISTANCE}
 SWEEP_OPTIONS = {**_SWEPT, "first_contact": ("end_poses", "tolerance", "screw", "linear")}
+
+SWITCHES = ("signed", "originals", "screw", "linear")
 
 # A launch of 32 threads a pair stays within 2^31.
 PAIRS_MAX = 2**26
@@ -90,7 +92,7 @@ def check_request(output: str, precision: str):
 
 
 def check_options(taken: dict, output: str, precision: str, options: dict) -> dict:
-    """Return the options of an output that are neither None nor False.
+    """Return the options of an output that are not None, nor switches that are off.
 
     Args:
         taken: One of the tables above.
@@ -98,8 +100,9 @@ def check_options(taken: dict, output: str, precision: str, options: dict) -> di
     Raises:
         ValueError: An unknown output or precision, or an option that means nothing for this output.
     """
-    given = {name: value for name, value in options.items() if value is not None and value is not False}
-    if output not in taken:
+    given = {name: value for name, value in options.items() if value is not None}
+    given = {name: value for name, value in given.items() if name not in SWITCHES or flag(value, name)}
+    if not isinstance(output, str) or output not in taken:
         check_request(output, precision)
     if output in ("distance", "first_contact") and precision != "exact":
         raise ValueError(f"precision means nothing for output {output!r}")

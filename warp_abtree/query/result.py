@@ -187,21 +187,21 @@ class Result(DeviceMemory):
         Answers are Python's numbers and lists, by the names of the result's arrays and of `pair_contacts`; what has an
         entry a face pair or contact point is left out.
         """
-        pairs = _to_host(self.pairs)
-        columns = {name: [self._name(i) for i in pairs[:, k].tolist()] for k, name in enumerate(("first", "second"))}
-        columns |= {name: _to_host(values).tolist() for name, values in self._pair_arrays()}
+        columns = {name: values.tolist() for name, values in self._pair_arrays()}
         return [dict(zip(columns, row)) for row in zip(*columns.values())]
 
     def _pair_arrays(self):
-        """Yield names and arrays of what has an entry a pair, on either side."""
+        """Yield names and arrays of what has an entry a pair, on the host."""
+        for name, objects in zip(("first", "second"), _to_host(self.pairs).T):
+            yield name, np.array([self._name(i) for i in objects.tolist()], object)
         for name in ("any", "count", "apart", *DISTANCES, "points", *TIMES):
             values = getattr(self, name)
             if values is not None and not isinstance(values, dict):  # of contact points, which no pair has one of
-                yield name, values
+                yield name, _to_host(values)
         summary = self.pair_contacts
         if summary is not None:
             names = summary if isinstance(summary, dict) else summary.dtype.names
-            yield from ((name, summary[name]) for name in names if name != "count")
+            yield from ((name, _to_host(summary[name])) for name in names if name != "count")
 
     def _name(self, i: int) -> str:
         return self._names[i] if i < len(self._names) else f"object {i}"
@@ -212,22 +212,16 @@ class Result(DeviceMemory):
         Raises:
             OSError: The file cannot be written; one that stood there stays.
         """
-        rows = [dict(_split(row)) for row in self.rows()]
+        columns = {}
+        for name, values in self._pair_arrays():
+            for place in np.ndindex(values.shape[1:]):
+                ends = ("xyz"[k] if size == 3 else str(k) for k, size in zip(place, values.shape[1:]))
+                columns["_".join((name, *ends))] = values[:, *place].tolist()
         with atomic_write(path, "w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(rows[0]) if rows else ["first", "second"])
-            writer.writeheader()
-            writer.writerows(rows)
+            writer = csv.writer(file)
+            writer.writerow(columns)
+            writer.writerows(zip(*columns.values()))
 
 
 def _to_host(values) -> np.ndarray:
     return values if isinstance(values, np.ndarray) else values.numpy()
-
-
-def _split(values):
-    """Yield names and numbers of a row: those of a vector by axis, of another list by place."""
-    for name, value in values.items():
-        if isinstance(value, list):
-            ends = "xyz" if len(value) == 3 else range(len(value))
-            yield from _split({f"{name}_{end}": part for end, part in zip(ends, value)})
-        else:
-            yield name, value

@@ -117,8 +117,8 @@ class KeptQueries:
 
     def find_first_contacts(self, pairs, end_poses, tolerance, screw, linear, device: bool) -> Result:
         """Answer `Scene.first_contact`; pairs are checked."""
-        key = "first contact", bool(linear), pairs is None
         FirstContactQuery.plan(tolerance, screw, linear)  # checks them
+        key = "first contact", bool(linear), pairs is None
         query = self.kept.pop(key, None)
         if query is None or query.is_filtered():
             query = FirstContactQuery(self._scene, end_poses, pairs, tolerance=tolerance, screw=screw, linear=linear)

@@ -1,6 +1,7 @@
 """Objects as a scene was told of them: checked, and kept on the host until the device's arrays are made."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,6 +13,7 @@ from warp_abtree.query.broad_phase import EVERY_WORLD
 from warp_abtree.state.poses import launch_place
 
 ALL_BITS = 2**32 - 1
+HOLE_LEAST = 2.0**-99  # edge of what is left of an object that was removed: models may not be smaller
 
 
 @dataclass
@@ -47,60 +49,54 @@ class ObjectList:
         places = [*taken, *range(count, count + len(models) - len(taken))]
         told = zip(columns["name"], models, places)
         columns["name"] = [f"{model.name} {i}" if name is None else name for name, model, i in told]
-        before = {name: [getattr(self, name)[i] for i in taken] for name in ("model", *columns)}
         try:
             for model in models:
                 if id(model) not in self.place:
                     self.models.append(model)
                     self.place[id(model)] = len(self.models) - 1
-            for name, values in (*columns.items(), ("model", [self.place[id(model)] for model in models])):
-                given = list(values)
-                self._write(name, taken, given[: len(taken)])
-                getattr(self, name).extend(given[len(taken) :])
+            columns["model"] = [self.place[id(model)] for model in models]
+            for name, values in columns.items():
+                getattr(self, name).extend(list(values)[len(taken) :])
+            if taken:
+                lists = self._written(taken, columns)
+                vars(self).update(lists | _without_unused(self.models, lists["model"]), free=self.free[len(taken) :])
         except BaseException:
-            for name, values in before.items():
-                self._write(name, taken, values)
+            for name in ("model", *columns):
                 del getattr(self, name)[count:]
             del self.models[known:]
             self.place = {id(model): i for i, model in enumerate(self.models)}
             raise
-        if taken:
-            self.free = self.free[len(taken) :]
-            self._drop_models()
         return np.array(places, np.int64)
 
-    def _write(self, name: str, places: list[int], values: list):
-        if name == "name" and places:
-            self.name = list(self.name)
-        column = getattr(self, name)
-        for i, value in zip(places, values):
-            column[i] = value
-
     def change(self, i: int, columns: dict[str, list]):
-        """Change lists at one place."""
-        for name, values in columns.items():
-            self._write(name, [i], values)
+        """Change lists at one place, wholly or not at all."""
+        vars(self).update(self._written([i], columns))
 
     def remove(self, places: list[int]):
-        """Take objects out of their places: what is left there is static, meets nothing, and has one triangle."""
-        if self.hole is None:
-            size = float(np.ptp(self.models[self.model[places[0]]].mesh_at(0)[0], axis=0).max())
-            self.hole = Model.from_arrays(np.eye(3) * size / 1024, np.array([[0, 1, 2]]), name="removed")
-        if id(self.hole) not in self.place:
-            self.models.append(self.hole)
-            self.place[id(self.hole)] = len(self.models) - 1
-        left = {"model": self.place[id(self.hole)], "lod": 0, "importance": 1, "static": True, "solid": False}
-        for name, value in {**left, "group": 0, "mask": 0, "name": "removed"}.items():
-            self._write(name, places, [value] * len(places))
-        self.free = sorted([*self.free, *places])
-        self._drop_models()
+        """Take objects out of their places, wholly or not at all.
 
-    def _drop_models(self):
-        """Forget models that no place has."""
-        used = sorted(set(self.model))
-        number = {old: new for new, old in enumerate(used)}
-        self.models, self.model = [self.models[k] for k in used], [number[k] for k in self.model]
-        self.place = {id(model): i for i, model in enumerate(self.models)}
+        What is left there is static, meets nothing, and has one triangle.
+        """
+        hole, models = self.hole, list(self.models)
+        if hole is None:
+            size = float(np.ptp(models[self.model[places[0]]].mesh_at(0)[0], axis=0).max())
+            edge = max(size / 1024, HOLE_LEAST)
+            hole = Model.from_arrays(np.eye(3) * edge, np.array([[0, 1, 2]]), name="removed")
+        if id(hole) not in self.place:
+            models.append(hole)
+        left: dict[str, Any] = {"name": "removed", "model": self.place.get(id(hole), len(self.models)), "lod": 0}
+        left |= {"importance": 1, "static": True, "solid": False, "group": 0, "mask": 0}
+        lists = self._written(places, {name: [value] * len(places) for name, value in left.items()})
+        lists |= _without_unused(models, lists["model"])
+        vars(self).update(lists, hole=hole, free=sorted([*self.free, *places]))
+
+    def _written(self, places: list[int], columns: dict[str, list]) -> dict[str, list]:
+        """Return copies of lists, by name, with other values at some places: one step puts them all in place."""
+        copies = {name: list(getattr(self, name)) for name in columns}
+        for name, values in columns.items():
+            for i, value in zip(places, values):
+                copies[name][i] = value
+        return copies
 
     def collision_bits(self) -> np.ndarray:
         """Return collision group and mask of each object, uint32 (n, 2); (0, 2) where they keep no pair apart."""
@@ -121,6 +117,15 @@ class ObjectList:
             rotation[matrix], position[matrix] = stacked[:, :3, :3], stacked[:, :3, 3]
             pool.rotation.assign(rotation)
             pool.position.assign(position)
+
+
+def _without_unused(models: list[Model], model: list[int]) -> dict[str, Any]:
+    """Return the lists of `ObjectList` about models, without those that no place has."""
+    used = sorted(set(model))
+    if len(used) < len(models):
+        number = {old: new for new, old in enumerate(used)}
+        models, model = [models[k] for k in used], [number[k] for k in model]
+    return {"models": models, "model": model, "place": {id(one): i for i, one in enumerate(models)}}
 
 
 def check_models(models, count: int) -> list[Model]:
@@ -192,13 +197,15 @@ def check_object_names(names, count: int) -> list[str | None]:
     Raises:
         ValueError: Another number of them, or one that is no string with a character.
     """
+    if isinstance(names, str) or not (names is None or np.iterable(names)):
+        raise ValueError(f"names: {names!r} is no list of strings")
     listed = [None] * count if names is None else list(names)
     if len(listed) != count:
         raise ValueError(f"names: {len(listed)} given for {count} objects")
     for name in listed:
         if name is not None and not (isinstance(name, str) and name):
             raise ValueError(f"name {name!r} is no string with a character")
-    return listed
+    return [None if name is None else str(name) for name in listed]
 
 
 def check_columns(models, names, worlds, importances, flags, bits) -> dict[str, list]:

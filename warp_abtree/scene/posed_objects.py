@@ -1,5 +1,6 @@
 """Posed objects of a scene: added, removed and changed on the host, moved and brought to LODs on the device."""
 
+from bisect import bisect_left
 from typing import Any
 
 import numpy as np
@@ -172,8 +173,8 @@ class PosedObjects(DeviceMemory):
         """Remove objects. Indices of others stay; the next `add` takes the lowest place that is free.
 
         A place without an object keeps its index: the broad phase never pairs it, pairs that name it are refused, and
-        what is given an object, such as poses and LODs, goes on having an entry for it, which means nothing. Its model
-        is one of a single triangle. A filter of the object goes with it.
+        what is given an object goes on having an entry for it, which means nothing: a pose, any LOD, a number. Its
+        model is one of a single triangle. A filter of the object goes with it.
 
         Args:
             i: Index of an object, or (k,) of them.
@@ -186,10 +187,17 @@ class PosedObjects(DeviceMemory):
         removed = [self._check_object(k) for k in (given.tolist() if given.ndim else [given.item()])]
         if len(set(removed)) != len(removed):
             raise ValueError("objects: one is named twice")
-        self._retire("removing an object")
-        self._objects.remove(removed)
+        if not removed:
+            return
         named = np.isin(self._excluded >> 32, removed) | np.isin(self._excluded & (2**32 - 1), removed)
-        self._excluded = self._excluded[~named]
+        self._retire("removing an object")
+        before = self._excluded
+        try:
+            self._excluded = before[~named]
+            self._objects.remove(removed)
+        except BaseException:
+            self._excluded = before
+            raise
 
     def change(
         self,
@@ -224,7 +232,8 @@ class PosedObjects(DeviceMemory):
 
     def _check_object(self, i) -> int:
         i = whole_number(i, "object", 0, self.object_count - 1)
-        if i in self._objects.free:
+        free = self._objects.free
+        if i in free[(k := bisect_left(free, i)) : k + 1]:
             raise ValueError(f"object {i} was removed")
         return i
 
@@ -235,8 +244,12 @@ class PosedObjects(DeviceMemory):
         check_device(self.device, what)
         self._objects.pose, self._objects.lod = list(self._read_matrices()), self._batch.lods.tolist()
         self._batch.retire()
-        self._kept.clear()
-        self._batch = None
+        self._drop_retired()
+
+    def _drop_retired(self):
+        """Forget arrays that are retired, also by an edit that was interrupted then."""
+        if self._batch is not None and self._batch.retired:
+            vars(self).update(_batch=None, _kept={})
 
     def _read_matrices(self) -> np.ndarray:
         objects = self.batch().objects
@@ -250,6 +263,7 @@ class PosedObjects(DeviceMemory):
 
         Tree states that an interrupted change of LODs has left torn are made anew.
         """
+        self._drop_retired()
         if self._batch is None:
             if not self.object_count:
                 raise ValueError("the scene has no object")
@@ -315,7 +329,8 @@ class PosedObjects(DeviceMemory):
         """Bring every object to a LOD: meshes are refined and trees updated in one batch, states are shared.
 
         Args:
-            lods: (n,) whole numbers, each from 0 to its model's lod_max; of any framework, copied from a GPU.
+            lods: (n,) whole numbers, each from 0 to its model's lod_max; of any framework, copied from a GPU. Of a
+                place without an object it is not read.
 
         Raises:
             ValueError: Wrong shape or a LOD out of range; nothing is changed.
@@ -325,6 +340,7 @@ class PosedObjects(DeviceMemory):
         lods = to_numpy(lods, "lods")
         if lods.shape != (self.object_count,):
             raise ValueError(f"lods: shape {lods.shape} given for {self.object_count} objects")
+        lods = np.where(self.present, lods, 0)
         if lods.dtype.kind not in "iu" and not (lods.dtype.kind == "f" and (lods == np.floor(lods)).all()):
             raise ValueError(f"lods: type {lods.dtype} holds no whole numbers")
         top = np.array([model.lod_max for model in self.models])[self.object_model]

@@ -56,6 +56,7 @@ class Scene(PosedObjects):
 
     @property
     def _queries(self) -> KeptQueries:
+        self._drop_retired()
         if "queries" not in self._kept:
             self._kept["queries"] = KeptQueries(self, self._find_pairs)
         return self._kept["queries"]

@@ -249,7 +249,7 @@ class Frame(DeviceMemory):
             self._lods.columns = stages.table.columns(found["levels"])
         tests = found["node_tests"] + int(TRIANGLE_WORK) * found["triangle_tests"]
         row = found | self._lods.columns | stage_ms
-        row |= {"frame": len(self.history), "time": frame.time, "objects": self.scene.object_count}
+        row |= {"frame": len(self.history), "time": frame.time, "objects": int(self.scene.present.sum())}
         row["budget_ms"] = getattr(self.lods, "budget_ms", None)
         if stages.query.output == "any":
             row["hits"] = None

@@ -78,19 +78,23 @@ class LodColumns:
     """Columns of a `FrameRow` about LODs.
 
     Args:
-        models: `Model`s.
+        scene: `Scene` of the objects.
         level_model, level_lod: Model and LOD of each level at which objects may stand, in this order, int arrays.
     """
 
-    def __init__(self, models, level_model, level_lod):
-        self.lod = np.asarray(level_lod)
-        levels = [(models[model], lod) for model, lod in zip(np.asarray(level_model).tolist(), self.lod.tolist())]
+    def __init__(self, scene, level_model, level_lod):
+        self.lod, level_model = np.asarray(level_lod), np.asarray(level_model)
+        levels = [(scene.models[model], lod) for model, lod in zip(level_model.tolist(), self.lod.tolist())]
+        # Levels of the model that places without an object have count for nothing, but where there is no object.
+        present, self.counts = scene.present, np.ones(len(levels), bool)
+        if present.any() and not present.all():
+            self.counts = np.isin(level_model, np.array(scene.object_model)[present])
         self.error = np.array([model.error_at(lod) for model, lod in levels])
         self.faces = np.array([model.progressive.active_count(lod) for model, lod in levels])
 
     def columns(self, count) -> dict[str, Any]:
         """Return the columns for a number of objects at each level, int array."""
-        used = np.flatnonzero(count)
+        used = np.flatnonzero(count * self.counts)
         repeats, error = count[used], self.error[used]
         return {
             "states": len(used),
@@ -130,5 +134,5 @@ class LodTracker:
         self._direction = np.where(direction == 0, self._direction, direction)
         self._lods = lods
         keys, repeats = np.unique((np.array(scene.object_model, np.int64) << 32) + lods, return_counts=True)
-        self.columns = LodColumns(scene.models, keys >> 32, keys & (2**32 - 1)).columns(repeats)
+        self.columns = LodColumns(scene, keys >> 32, keys & (2**32 - 1)).columns(repeats)
         return {"lods_changed": int(np.count_nonzero(direction)), "oscillations": int(turned)}

@@ -85,12 +85,13 @@ class FrameStages:
 
     def _serve(self, controller):
         """Let objects stand at the levels of a controller's ladder."""
+        controller.view.check()  # its ladder is of the models that the scene had
         ladder = controller.ladder.levels()
         shared = shares_levels(self.batch.object_model, ladder)
         self._levels = made = LevelStates(self.batch, ladder, self.batch.lods, shared)
         made.wanted = controller.lods
         self.batch.follow(made)
-        self.table = LodColumns(self.scene.models, made.level_model, made.level_lod)
+        self.table = LodColumns(self.scene, made.level_model, made.level_lod)
         self._count, self._changed = made.levels.count, made.levels.changed
         if made.plan is not None:
             self._marked = made.plan.marked_count

@@ -59,7 +59,7 @@ class Batch(DeviceMemory):
         self.filter_generation = Generation(self.device)
         self.mean_faces = float(models.face_count[self.object_model].mean()) if len(self.object_model) else 1.0
         self.solids = SolidArrays(models, states, solid) if np.any(solid) else None
-        self._retired = False
+        self.retired = False
         self._trees, self._trees_made = Trees(), (-1, 0, 0)
 
     @property
@@ -195,11 +195,11 @@ class Batch(DeviceMemory):
         """Refuse operators from now on: the scene has other objects."""
         self.states.generation.advance()
         self.objects.generation.advance()
-        self._retired = True
+        self.retired = True
 
     def check(self, user: str):
         """Raise RuntimeError where the batch is no longer that of its scene; name its user, such as "query"."""
-        if self._retired:
+        if self.retired:
             raise RuntimeError(
                 f"objects were added to the scene, removed or changed since this {user} was made; make a new one"
             )

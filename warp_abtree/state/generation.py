@@ -34,6 +34,7 @@ class Generation:
 
     def advance(self):
         """Count a replacement. To be called before it, so that an interruption between the two is on the safe side."""
+        self._uneven = True
         self.number += 1
         self._write()
 

@@ -47,12 +47,12 @@ class Clash:
 def assembly_size(scene: Scene) -> float:
     """Return the diagonal of the box around all objects [world units]."""
     objects = scene.batch().objects.pool
-    corners = []
-    for model, turn, shift in zip(scene.object_model, objects.rotation.numpy(), objects.position.numpy()):
-        vertices = scene.models[model].mesh_at(scene.models[model].lod_max)[0]
-        posed = vertices @ turn.T + shift
+    corners, turns, shifts = [], objects.rotation.numpy(), objects.position.numpy()
+    for i in np.flatnonzero(scene.present):
+        model = scene.models[scene.object_model[i]]
+        posed = model.mesh_at(model.lod_max)[0] @ turns[i].T + shifts[i]
         corners += [posed.min(0), posed.max(0)]
-    return float(np.linalg.norm(np.ptp(corners, axis=0)))
+    return float(np.linalg.norm(np.ptp(corners or np.zeros((1, 3)), axis=0)))
 
 
 def find_clashes(scene: Scene, within: float = 0.0, tolerance: float | None = None) -> list[Clash]:

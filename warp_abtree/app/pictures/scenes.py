@@ -105,7 +105,7 @@ def draw_clashes(scene: Scene, result, path, title: str):
     """Draw a scene to a PNG file, with the faces, curves and names of a result's pairs that have contacts."""
     view, cache = make_view("y"), geometry.MeshCache(scene)
     snapshot = Snapshot(0, 0.0, scene.poses, scene.lods, result, None)
-    panel = make_panel(cache, compose(cache, snapshot, np.arange(scene.object_count), Settings()))
+    panel = make_panel(cache, compose(cache, snapshot, np.flatnonzero(scene.present), Settings()))
     panel.lines.append((np.stack([result.contacts["p0"], result.contacts["p1"]], 1), NEAREST_COLOUR))
     met = np.flatnonzero(result.count)[:LABELS]
     panel.labels += [(result.pair_contacts["point"][k], ", ".join(map(scene.name, result.pairs[k]))) for k in met]

@@ -79,9 +79,7 @@ class RobotQuery(DeviceMemory):
         given = made.batch, request, max(1, PAIRS_GUESS * room)
         kinds: dict[str, Any] = {"distance": LinkDistances, "pairs": LinkPairs}
         self._links: Any = kinds[output](*given) if output in kinds else LinkHits(*given, output == "within")
-        told = map(around.name, range(made.count)) if made.count and output in kinds else ()
-        # Of models of the robot, of what surrounds it, and of -1.
-        self._names = np.array([*[robot.link_names[k] for k in robot.model_link], *told, ""])
+        self._own_names = [robot.link_names[k] for k in robot.model_link]
         self.nearest = self._links.nearest
         self.configurations, self._chunk = self._links.configurations, self._links.chunk
         self.hit = self._chunk.hit
@@ -91,6 +89,10 @@ class RobotQuery(DeviceMemory):
     def take_poses(self):
         """Read where what surrounds the robot is now. Launches only."""
         self.robots.take_poses()
+
+    def _names(self) -> list[str]:
+        """Return the names of models of the robot, of what surrounds it now, and of -1."""
+        return [*self._own_names, *self.robots.names(), ""]
 
     def launch(self):
         """Check all configurations. Launches only."""
@@ -112,7 +114,8 @@ class RobotQuery(DeviceMemory):
     def ask(self, rows: wp.array, beyond: float = np.inf) -> np.ndarray | list:
         """Return the answers of configurations, device rows (c, n), see `Robot.check`. Waits for the device."""
         self.take_poses()
-        nearest, listed = np.dtype([*NEAREST_ROWS.descr, ("names", self._names.dtype, 2)]), []
+        names = np.array(self._names() if self.nearest else [""])
+        nearest, listed = np.dtype([*NEAREST_ROWS.descr, ("names", names.dtype, 2)]), []
         answers = np.empty(len(rows), nearest if self.output == "distance" else bool)
         for start in range(0, len(rows), self.room):
             count = min(self.room, len(rows) - start)
@@ -129,7 +132,7 @@ class RobotQuery(DeviceMemory):
             for name in ("distance", "points", "faces", "pair"):
                 part[name] = getattr(self.nearest, name)[:count].numpy()
             part["pair"] = np.where(part["pair"] < 0, -1, self._number(part["pair"]))
-            part["names"] = self._names[part["pair"]]
+            part["names"] = names[part["pair"]]
         return listed if self.output == "pairs" else answers
 
     def _number(self, objects) -> np.ndarray:
@@ -138,7 +141,7 @@ class RobotQuery(DeviceMemory):
 
     def _list_pairs(self, count) -> list[list[tuple[str, str]]]:
         """Return the pairs of names that intersect at each of the configurations of the last launch."""
-        pairs, names = np.concatenate(self._links.found), self._names.tolist()
+        pairs, names = np.concatenate(self._links.found), self._names()
         rows: list[set] = [set() for _ in range(count)]
         places = (pairs[:, 0] - self._around) // self._models
         for place, (a, b) in zip(places.tolist(), np.sort(self._number(pairs)).tolist()):

@@ -155,8 +155,9 @@ class Robot:
 
     def _find_links(self, names, what: str) -> list[int]:
         """Return the indices of links of names."""
-        if isinstance(names, str):
-            raise TypeError(f"{what}: {names!r} is a name, not a list of names of links")
+        if isinstance(names, str) or not np.iterable(names):
+            kind = "a name" if isinstance(names, str) else f"a {type(names).__name__}"
+            raise TypeError(f"{what}: {names!r} is {kind}, not a list of names of links")
         for name in names:
             if name not in self.link_names:
                 raise ValueError(f"{what}: the robot has no link {name!r}")
@@ -369,8 +370,9 @@ class Robot:
         i, k = divmod(bad, len(self.joint_names))
         value = float(rows[i : i + 1].numpy()[0, k])
         low, high = map(exact, self.limits[k])
-        beyond = f", outside {low} .. {high}" if abs(value) < forward.ANGLE_MAX else ""
-        return i, f"{exact(value)} for joint {self.joint_names[k]!r}{beyond}"
+        most = float(forward.ANGLE_MAX)
+        wrong = f"outside {low} .. {high}" if abs(value) < most else f"no finite number within {most:.0f}"
+        return i, f"{exact(value)} for joint {self.joint_names[k]!r}, {wrong}"
 
     def _find_query(self, world, output, count) -> RobotQuery:
         """Return a query of a room for a number of configurations: the one of before if it is of the same."""

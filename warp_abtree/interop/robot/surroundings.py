@@ -75,6 +75,10 @@ class RobotBatch:
             return True  # of models that were given again
         return self._batch is around.batch() and np.array_equal(self._lods, around.lods)
 
+    def names(self) -> list[str]:
+        """Return the names of the objects of the surroundings."""
+        return [] if self._batch is None else self._batch.names
+
     def take_poses(self):
         """Copy the poses of what surrounds the robot; raise RuntimeError if objects were added to it. Launches only."""
         if self._batch is not None:

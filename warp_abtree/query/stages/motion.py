@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import check_device, to_numpy
+from warp_abtree.checks.arguments import check_device, flag, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.base.arrays import ObjectPool
@@ -57,8 +57,8 @@ def check_time_tolerance(tolerance) -> float:
 
 
 def check_path(screw, linear):
-    """Raise ValueError for two paths at a time."""
-    if screw and linear:
+    """Raise ValueError for two paths at a time, or what is no bool."""
+    if flag(screw, "screw") & flag(linear, "linear"):
         raise ValueError("screw and linear: objects move on one kind of path")
 
 
@@ -271,9 +271,9 @@ class FirstContactQuery(Operator):
         """Take another tolerance, and screws or not, from the next launch on; a captured graph keeps its own.
 
         Raises:
-            ValueError: A tolerance out of range.
+            ValueError: A tolerance out of range, or no bool.
         """
-        asked, motions = (check_time_tolerance(tolerance), bool(screw)), self._motions
+        asked, motions = (check_time_tolerance(tolerance), flag(screw, "screw")), self._motions
         if asked != (motions.tolerance, motions.screw):
             motions.tolerance, motions.screw = asked
             self.commands = Commands()
