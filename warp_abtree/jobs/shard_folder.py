@@ -196,8 +196,8 @@ def _count_poses(job, name, values) -> int:
     Of motions those that are not proved clear.
     """
     if job["output"] in POSE_OUTPUTS:
-        meets = {"distance": lambda found: found <= 0, "clear": np.logical_not}.get(name, np.asarray)
-        return int(np.count_nonzero(meets(values))) if name == POSE_OUTPUTS[job["output"]] else 0
+        meets = values <= 0 if name == "distance" else ~values if name == "clear" else values
+        return int(np.count_nonzero(meets)) if name == POSE_OUTPUTS[job["output"]] else 0
     return int(np.count_nonzero(values[1:] != values[:-1])) + bool(len(values)) if name == "pose" else 0
 
 
