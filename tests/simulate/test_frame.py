@@ -257,7 +257,7 @@ steps = [(top, top - 1, 0), (top, top - 1, top - 1), (0, 1, 2), (top, top, top)]
 lods = lambda time: np.array(steps[min(round(60 * time), 3)])
 if kind == "budget":
     lods = ab.PredictiveController(scene, 1e6, ab.Camera.look_at((0, 0, 9), (0, 0, 0)))
-frame = ab.Frame(scene, motion, lods)
+frame = ab.Frame(scene, motion, lods, "count")
 before = scene.lods.tolist(), scene.batch().objects.pool.position.numpy().tobytes()
 frame.warm_up()
 assert before == (scene.lods.tolist(), scene.batch().objects.pool.position.numpy().tobytes()) and not frame.history
