@@ -31,6 +31,8 @@ def assembly(**more):
 def test_equal_meshes_share_a_model_whatever_their_node(tmp_path, suffix):
     if suffix == "3mf":
         pytest.importorskip("lxml"), pytest.importorskip("networkx")
+        if int(trimesh.__version__.split(".")[0]) < 5:
+            pytest.skip("trimesh 4 writes 3MF whose components are not there")
     path = tmp_path / f"assembly.{suffix}"
     assembly().export(path)
     scene = ab.scene_from_file(path, device="cpu", solid=True)
