@@ -19,6 +19,8 @@ from warp_abtree.scene.scene import Scene
 
 # Points of a thread: the next starts from the last one's nearest face.
 RUNS = {"cpu": 256, "cuda": 8}
+# Of a point, so that squares of distances stay finite.
+COORDINATE_MAX = 2.0**500
 # Models whose device arrays are kept for the next call.
 KEPT_MODELS = 4
 
@@ -41,7 +43,8 @@ def signed_distance(model: Model, points, lod=None, device=None, signed: bool = 
     Raises:
         TypeError: model is no Model.
         MeshError: The mesh is not closed and has no inside; the message names edges.
-        ValueError: Points of another shape or not finite, the first is named; a LOD out of range, no such device.
+        ValueError: Points of another shape, not finite or beyond 2^500, the first is named; a LOD out of range, no such
+            device.
     """
     (model,) = check_models(model, 1)
     if flag(signed, "signed"):
@@ -55,7 +58,7 @@ def signed_distance(model: Model, points, lod=None, device=None, signed: bool = 
     if n:
         rows = wp.array(points, dtype=wp.vec3d, device=scene.device)
         run = RUNS["cpu" if scene.device.is_cpu else "cuda"]
-        inputs = [run, signed, batch.trees, rows, _sort(model, points, rows), *made.values()]
+        inputs = [run, signed, batch.trees, rows, _sort(points, rows), *made.values()]
         wp.launch(kernels.measure_point_kernel, -(-n // run), inputs, device=scene.device, block_dim=64)
     distance, face, point = (array.numpy() for array in made.values())
     return (distance, point, face) if return_nearest else distance
@@ -77,13 +80,15 @@ def _check_points(points) -> np.ndarray:
     sound = np.isfinite(points).all(1)
     if not sound.all():
         raise ValueError(f"points: point {sound.argmin()} is not finite")
+    near = (np.abs(points) <= COORDINATE_MAX).all(1)
+    if not near.all():
+        raise ValueError(f"points: point {near.argmin()} is farther away than 2^500, whose square would overflow")
     return points
 
 
-def _sort(model, points, rows) -> wp.array:
-    """Return indices of points along a Morton curve through a box around model and points."""
-    vertices = model.mesh_at(0)[0]
-    lower, upper = (f(np.concatenate([vertices, points]), axis=0) for f in (np.min, np.max))
+def _sort(points, rows) -> wp.array:
+    """Return indices of points along a Morton curve through their box."""
+    lower, upper = points.min(0), points.max(0)
     cell = float((upper - lower).max()) / 2 ** int(kernels.CODE_BITS)
     code, order = (wp.empty(2 * len(points), dtype=wp.int32, device=rows.device) for _ in range(2))
     inputs = [wp.vec3d(lower), wp.float64(cell or 1.0), rows, code, order]
