@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, flag, to_numpy
 from warp_abtree.kernels.inside import point_distance as kernels
+from warp_abtree.model.mesh import COORDINATE_MAX
 from warp_abtree.model.model import Model
 from warp_abtree.model.winding import check_solid
 from warp_abtree.scene.objects import check_models
@@ -19,8 +20,6 @@ from warp_abtree.scene.scene import Scene
 
 # Points of a thread: the next starts from the last one's nearest face.
 RUNS = {"cpu": 256, "cuda": 8}
-# Of a point, so that squares of distances stay finite.
-COORDINATE_MAX = 2.0**500
 # Models whose device arrays are kept for the next call.
 KEPT_MODELS = 4
 
@@ -43,7 +42,7 @@ def signed_distance(model: Model, points, lod=None, device=None, signed: bool = 
     Raises:
         TypeError: model is no Model.
         MeshError: The mesh is not closed and has no inside; the message names edges.
-        ValueError: Points of another shape, not finite or beyond 2^500, the first is named; a LOD out of range, no such
+        ValueError: Points of another shape, not finite or beyond 2^300, the first is named; a LOD out of range, no such
             device.
     """
     (model,) = check_models(model, 1)
@@ -82,7 +81,7 @@ def _check_points(points) -> np.ndarray:
         raise ValueError(f"points: point {sound.argmin()} is not finite")
     near = (np.abs(points) <= COORDINATE_MAX).all(1)
     if not near.all():
-        raise ValueError(f"points: point {near.argmin()} is farther away than 2^500, whose square would overflow")
+        raise ValueError(f"points: point {near.argmin()} has a coordinate beyond 2^300, the most that a mesh may have")
     return points
 
 
