@@ -100,7 +100,9 @@ def test_bad_points_and_models_are_refused(device):
     refused(ValueError, "points: shape", ab.signed_distance, ball, np.zeros(3), device=device)
     refused(ValueError, "points: shape", ab.contains, ball, np.zeros((2, 4)), device=device)
     refused(ValueError, "point 1 is not finite", ab.contains, ball, [[0, 0, 0], [0, np.nan, 0]], device=device)
-    refused(ValueError, "point 1 has a coordinate beyond", ab.contains, ball, [[0, 0, 0], [0, 0, -1e160]], device=device)
+    refused(
+        ValueError, "point 1 has a coordinate beyond", ab.contains, ball, [[0, 0, 0], [0, 0, -1e160]], device=device
+    )
     far = ab.signed_distance(ball, [[2.0**300, 0, -(2.0**299)], [0, 0, 1e80]], device=device)
     np.testing.assert_allclose(far, [np.hypot(2.0**300, 2.0**299), 1e80], rtol=1e-12)
     refused(ValueError, "LOD", ab.contains, ball, still, ball.lod_max + 1, device)
