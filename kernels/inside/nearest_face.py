@@ -2,7 +2,7 @@
 
 Distances are those of `triangle.triangle_pair` for a face and a point: at most the slack of `Solid` off, whatever the
 face. Boxes are compared in their own frame, to which the point is taken by the transpose of the rotation; the margin
-of `PairPose` covers that, a rotation off orthonormal included, along each axis, so twice of it along any line.
+of `SearchScale` covers that, a rotation off orthonormal included, along each axis, so twice of it along any line.
 """
 
 import warp as wp
@@ -30,7 +30,7 @@ class Solid:
     node: wp.int32  # where its tree lies in the pool
     centre: wp.vec3d  # of its model
     slack: wp.float64  # that distances to its faces err by [model units]
-    margin: wp.float64  # that boxes are wider by, beside a part of the distance
+    margin: wp.float64  # that boxes are wider by for rounding, beside a part of the distance
     grow: wp.float64  # a little over 1: that part
 
 
@@ -42,7 +42,7 @@ def make_solid(trees: Trees, pose: PairPose, scaling: SearchScale, of_b: bool, s
     solid.node = wp.where(of_b, pose.node_b, pose.node_a)
     solid.centre = trees.models.centre[trees.states.model[state]]
     solid.slack = scaling.pair_slack
-    solid.margin = wp.float64(2.0) * wp.float64(pose.margin) + scaling.pair_slack
+    solid.margin = wp.float64(2.0) * wp.float64(scaling.margin) / scaling.scale64 + scaling.pair_slack
     solid.grow = wp.float64(scaling.grow)
     return solid
 
