@@ -40,6 +40,10 @@ def vector_of_lane(x: wp.vec3, lane: wp.int32) -> wp.vec3: ...
 
 
 @native.func_native()
+def vector64_of_lane(x: wp.vec3d, lane: wp.int32) -> wp.vec3d: ...
+
+
+@native.func_native()
 def vote_lanes(flag: bool) -> wp.uint32:
     """Return a word with the bit of each lane that has set its flag."""
 
@@ -64,7 +68,7 @@ def warp_lane() -> wp.int32: ...
 
 @native.func_native()
 def resolve_lane() -> wp.int32:
-    """Return the lane of a warp in a block of RESOLVE_WARPS."""
+    """Return the lane of a warp in a block of several."""
 
 
 @native.func_native()

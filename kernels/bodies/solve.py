@@ -11,7 +11,7 @@ Pairs of one color share no dynamic body, so one thread for all of them and a th
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.lanes import block_sync
+from warp_abtree.kernels.base.lanes import block_sync, resolve_lane, vector64_of_lane, warp_max, warp_size, warp_sync
 from warp_abtree.kernels.base.poses import HALF, PairBatch
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, ONE, ZERO, Bodies
 from warp_abtree.kernels.bodies.constraints import Constraints
@@ -33,8 +33,11 @@ RECOVERY = wp.constant(wp.float64(_FREQUENCY / _RESPONSE))
 SOFTNESS = wp.constant(wp.float64(1.0 / (1.0 + _FREQUENCY * _RESPONSE)))
 """Part of the impulse that it gives up."""
 
-VISITS_LEAST, VISITS_MAX = wp.constant(3), wp.constant(64)
+VISITS_LEAST, VISITS_MAX, VISITS_EXTREME = wp.constant(3), wp.constant(8), wp.constant(64)
 """How often the points of a pair are relaxed before the next pair; more than the least while speeds change much."""
+
+EXTREME = wp.constant(wp.float64(2.0**10))
+"""Times `fast` at which points meet that may be relaxed VISITS_EXTREME times: what is left of that speed is fast, too."""
 
 SETTLED = wp.constant(wp.float64(2.0**-6))
 SETTLED_IMPACT = wp.constant(wp.float64(2.0**-30))
@@ -49,7 +52,7 @@ class Relaxation:
     backward: wp.int32  # 1 if it goes from the last pair to the first
     first_color: wp.int32  # first color of the range
     last_color: wp.int32  # last color of the range
-    threads: wp.int32  # threads of the launch; one block where there are several colors
+    warps: wp.int32  # warps of the launch; one block where there are several colors
     friction: wp.float64  # coefficient of Coulomb's law
     fast: wp.float64  # speed from which on points that meet strike [world units/s]; 0 without gravity
     rest: wp.float64  # depth at which points rest, in slops
@@ -75,6 +78,20 @@ class BodyMotion:
     velocity: wp.vec3d  # of the centre of mass [world units/s]
     angular_velocity: wp.vec3d  # world frame [rad/s]
     momentum: wp.vec3d  # angular momentum, world frame
+
+
+@wp.struct
+class RelaxedPoint:
+    """A point of a pair while it is relaxed."""
+
+    normal: wp.vec3d  # from the first object to the second
+    arm_a: wp.vec3d  # from the centre of mass of the first object to where its impulses act
+    arm_b: wp.vec3d  # from that of the second
+    response: wp.vec3d  # velocity that a unit impulse along the normal gives
+    mass: wp.float64  # impulse along the normal that a unit of speed along it takes
+    room: wp.float64  # how far it may approach [world units], below 0 if it is too deep
+    along: wp.float64  # impulse along the normal
+    across: wp.vec3d  # across it, world frame
 
 
 @wp.func
@@ -105,11 +122,10 @@ def store_motion(side: Side, motion: BodyMotion, bodies: Bodies, i: wp.int32):
 
 
 @wp.func
-def push(side: Side, motion: BodyMotion, arm: wp.vec3d, impulse: wp.vec3d):
-    """Return the motion of an object after an impulse at the end of an arm."""
+def push(side: Side, motion: BodyMotion, impulse: wp.vec3d, moment: wp.vec3d):
+    """Return the motion of an object after an impulse, and its moment about the centre of mass."""
     if not side.is_dynamic:
         return motion
-    moment = wp.cross(arm, impulse)
     after = BodyMotion()
     after.velocity = motion.velocity + side.inverse_mass * impulse
     after.momentum = motion.momentum + moment
@@ -125,10 +141,11 @@ def relative_velocity(motion_a: BodyMotion, motion_b: BodyMotion, arm_a: wp.vec3
 
 
 @wp.func
-def mobility(side: Side, arm: wp.vec3d, direction: wp.vec3d):
-    """Return the speed along a direction that a unit impulse along it gives an object where its arm ends."""
-    moment = wp.cross(arm, direction)
-    return wp.where(side.is_dynamic, side.inverse_mass + wp.dot(moment, side.inverse_inertia * moment), ZERO)
+def response_of(side: Side, arm: wp.vec3d, impulse: wp.vec3d):
+    """Return the velocity that an impulse gives an object where its arm ends."""
+    if not side.is_dynamic:
+        return wp.vec3d()
+    return side.inverse_mass * impulse + wp.cross(side.inverse_inertia * wp.cross(arm, impulse), arm)
 
 
 @wp.func
@@ -147,18 +164,42 @@ def approach_of(relaxation: Relaxation, corrects: bool, slop: wp.float64, room: 
 
 
 @wp.func
-def friction_of(
-    a: Side, b: Side, arm_a: wp.vec3d, arm_b: wp.vec3d, most: wp.float64, impulse: wp.vec3d, slide: wp.vec3d
-):
+def friction_of(a: Side, b: Side, point: RelaxedPoint, most: wp.float64, slide: wp.vec3d):
     """Return the friction impulse of a point that stops its tangential velocity `slide`, cut to `most`."""
     if most <= ZERO:
         return wp.vec3d()
-    direction = wp.normalize(slide)
-    wanted = impulse - slide / (mobility(a, arm_a, direction) + mobility(b, arm_b, direction))
-    length = wp.length(wanted)
-    if length > most:
-        wanted = wanted * (most / length)
+    response = wp.dot(slide, response_of(a, point.arm_a, slide) + response_of(b, point.arm_b, slide))
+    wanted = wp.vec3d(point.across)
+    if response > ZERO:
+        wanted -= (wp.dot(slide, slide) / response) * slide
+    square = wp.dot(wanted, wanted)
+    if square > most * most:
+        wanted = (most / wp.sqrt(square)) * wanted
     return wanted
+
+
+@wp.func
+def load_point(
+    rest: wp.float64, p: wp.int32, k: wp.int32, a: Side, b: Side, manifolds: Manifolds, constraints: Constraints
+):
+    """Return the k-th point of a pair, whose impulses act in the middle of where both objects have taken it.
+
+    Args:
+        rest: Depth at which it rests [world units].
+    """
+    point = RelaxedPoint()
+    n, first_a, first_b = manifolds.normal[p, k], constraints.arm_a[p, k], constraints.arm_b[p, k]
+    shift = b.moved - a.moved
+    point.normal = n
+    point.arm_a = first_a + HALF * shift
+    point.arm_b = first_b - HALF * shift
+    moved = shift + wp.cross(b.turned, first_b) - wp.cross(a.turned, first_a)
+    point.room = rest - manifolds.depth[p, k] + wp.dot(n, moved)
+    point.response = response_of(a, point.arm_a, n) + response_of(b, point.arm_b, n)
+    point.mass = ONE / wp.dot(n, point.response)
+    point.along = constraints.impulse[p, k]
+    point.across = constraints.friction_impulse[p, k]
+    return point
 
 
 @wp.func
@@ -172,60 +213,66 @@ def relax_pair(
 ):
     """Relax the points of a pair: the normal velocity, then the tangential one within the friction cone.
 
-    The motion of both objects stays in registers meanwhile. The points are relaxed several times, until they agree.
-    An impulse acts on both objects at one place, in the middle of where they have taken the point: no momentum is lost.
+    The points are relaxed several times, until they agree, one after the other: each by the lane of a warp that holds
+    it, while all lanes hold the motion of both objects. An impulse acts on both at one place: no momentum is lost. A
+    pair is struck if it meets fast where a pass begins.
     """
     stage, count, slop = relaxation.stage, manifolds.count[p], constraints.slop[p]
+    rest = relaxation.rest * slop
     a = load_side(bodies, pair[0])
     b = load_side(bodies, pair[1])
     motion_a = load_motion(bodies, pair[0])
     motion_b = load_motion(bodies, pair[1])
-    shift = b.moved - a.moved
     # Without gravity two rigid bodies are not pushed apart, which would add energy.
     corrects = stage == SOLVE and (relaxation.fast > ZERO or not (a.is_dynamic and b.is_dynamic))
-    settled = SETTLED * relaxation.fast
+    point = RelaxedPoint()
+    fastest = wp.float64(0.0)
+    for k in range(resolve_lane(), count, warp_size()):
+        point = load_point(rest, p, k, a, b, manifolds, constraints)
+        speed = wp.dot(point.normal, relative_velocity(motion_a, motion_b, point.arm_a, point.arm_b))
+        fastest = wp.max(fastest, -speed)
+    fastest = warp_max(fastest)
     struck = wp.where(stage == RELAX, constraints.is_struck[p], 0)
+    struck = wp.where(fastest > relaxation.fast, 1, struck)
+    settled = wp.max(SETTLED * relaxation.fast, SETTLED_IMPACT * fastest)
+    visits = wp.where(fastest > EXTREME * relaxation.fast, VISITS_EXTREME, VISITS_MAX)
     visit = wp.int32(0)
-    while visit < VISITS_MAX:
+    while visit < visits:
         change = wp.float64(0.0)
         for i in range(count):
             k = point_of_turn(i, count, relaxation.backward)
-            normal = manifolds.normal[p, k]
-            first_a, first_b = constraints.arm_a[p, k], constraints.arm_b[p, k]
-            moved = shift + wp.cross(b.turned, first_b) - wp.cross(a.turned, first_a)
-            arm_a = first_a + HALF * shift
-            arm_b = first_b - HALF * shift
-            along = constraints.impulse[p, k]
-            across = constraints.friction_impulse[p, k]
-            room = relaxation.rest * slop - manifolds.depth[p, k] + wp.dot(normal, moved)
-            speed = wp.dot(normal, relative_velocity(motion_a, motion_b, arm_a, arm_b))
-            excess = speed + approach_of(relaxation, corrects, slop, room)
-            if visit == 0:
-                settled = wp.max(settled, -SETTLED_IMPACT * speed)
-                struck = wp.where(speed < -relaxation.fast, 1, struck)
-            if along > ZERO or excess < ZERO or wp.length_sq(across) > ZERO:
-                soft = wp.where(corrects and room < ZERO and struck == 0, SOFTNESS, ZERO)
-                mass = ONE / (mobility(a, arm_a, normal) + mobility(b, arm_b, normal))
-                after = wp.max(along - soft * along - (ONE - soft) * mass * excess, ZERO)
-                change = wp.max(change, wp.abs(after - along) / mass)
-                motion_a = push(a, motion_a, arm_a, (along - after) * normal)
-                motion_b = push(b, motion_b, arm_b, (after - along) * normal)
-                along = after
-                # What is still to come near has no friction yet.
-                most = wp.where(room > slop, ZERO, relaxation.friction * along)
-                slide = relative_velocity(motion_a, motion_b, arm_a, arm_b)
-                wanted = friction_of(a, b, arm_a, arm_b, most, across, slide - wp.dot(normal, slide) * normal)
-                motion_a = push(a, motion_a, arm_a, across - wanted)
-                motion_b = push(b, motion_b, arm_b, wanted - across)
-                across = wanted
-                constraints.impulse[p, k] = along
-                constraints.friction_impulse[p, k] = across
+            if warp_size() == 1:
+                point = load_point(rest, p, k, a, b, manifolds, constraints)
+            n = point.normal
+            velocity = relative_velocity(motion_a, motion_b, point.arm_a, point.arm_b)
+            excess = wp.dot(n, velocity) + approach_of(relaxation, corrects, slop, point.room)
+            soft = wp.where(corrects and point.room < ZERO and struck == 0, SOFTNESS, ZERO)
+            after = wp.max((ONE - soft) * (point.along - point.mass * excess), ZERO)
+            more = after - point.along
+            velocity += more * point.response
+            # What is still to come near has no friction yet.
+            most = wp.where(point.room > slop, ZERO, relaxation.friction * after)
+            wanted = friction_of(a, b, point, most, velocity - wp.dot(n, velocity) * n)
+            impulse = more * n + (wanted - point.across)
+            moment_a = vector64_of_lane(wp.cross(point.arm_a, impulse), k)
+            moment_b = vector64_of_lane(wp.cross(point.arm_b, impulse), k)
+            impulse = vector64_of_lane(impulse, k)
+            motion_a = push(a, motion_a, -impulse, -moment_a)
+            motion_b = push(b, motion_b, impulse, moment_b)
+            if warp_size() == 1 or resolve_lane() == k:
+                change = wp.max(change, wp.abs(more) / point.mass)
+                point.along = after
+                point.across = wanted
+                constraints.impulse[p, k] = after
+                constraints.friction_impulse[p, k] = wanted
         visit += 1
-        if visit >= VISITS_LEAST and change <= settled:
-            visit = VISITS_MAX
-    constraints.is_struck[p] = struck
-    store_motion(a, motion_a, bodies, pair[0])
-    store_motion(b, motion_b, bodies, pair[1])
+        if visit >= VISITS_LEAST and warp_max(change) <= settled:
+            visit = visits
+    if resolve_lane() == 0:
+        constraints.is_struck[p] = struck
+        store_motion(a, motion_a, bodies, pair[0])
+        store_motion(b, motion_b, bodies, pair[1])
+    warp_sync()
 
 
 @wp.func
@@ -234,24 +281,35 @@ def hand_on_impulses(p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constrai
 
     These are not what the next substep needs: little of them may lift a body.
     """
+    count, struck = manifolds.count[p], constraints.is_struck[p]
+    half = HALF * (bodies.moved[pair[1]] - bodies.moved[pair[0]])
     impulse = wp.vec3d()
     moment_a = wp.vec3d()
     moment_b = wp.vec3d()
-    half = HALF * (bodies.moved[pair[1]] - bodies.moved[pair[0]])
-    for k in range(manifolds.count[p]):
-        if constraints.is_struck[p] != 0:
-            constraints.impulse[p, k] = ZERO
-            constraints.friction_impulse[p, k] = wp.vec3d()
-        of_point = constraints.impulse[p, k] * manifolds.normal[p, k] + constraints.friction_impulse[p, k]
-        impulse += of_point
-        moment_a += wp.cross(constraints.arm_a[p, k] + half, of_point)
-        moment_b += wp.cross(constraints.arm_b[p, k] - half, of_point)
-    if bodies.motion_type[pair[0]] == DYNAMIC:
-        bodies.impulse[pair[0]] -= impulse
-        bodies.moment[pair[0]] -= moment_a
-    if bodies.motion_type[pair[1]] == DYNAMIC:
-        bodies.impulse[pair[1]] += impulse
-        bodies.moment[pair[1]] += moment_b
+    for first in range(0, count, warp_size()):
+        of_point = wp.vec3d()
+        of_a = wp.vec3d()
+        of_b = wp.vec3d()
+        k = first + resolve_lane()
+        if k < count:
+            if struck != 0:
+                constraints.impulse[p, k] = ZERO
+                constraints.friction_impulse[p, k] = wp.vec3d()
+            of_point = constraints.impulse[p, k] * manifolds.normal[p, k] + constraints.friction_impulse[p, k]
+            of_a = wp.cross(constraints.arm_a[p, k] + half, of_point)
+            of_b = wp.cross(constraints.arm_b[p, k] - half, of_point)
+        for lane in range(wp.min(count - first, warp_size())):
+            impulse += vector64_of_lane(of_point, lane)
+            moment_a += vector64_of_lane(of_a, lane)
+            moment_b += vector64_of_lane(of_b, lane)
+    if resolve_lane() == 0:
+        if bodies.motion_type[pair[0]] == DYNAMIC:
+            bodies.impulse[pair[0]] -= impulse
+            bodies.moment[pair[0]] -= moment_a
+        if bodies.motion_type[pair[1]] == DYNAMIC:
+            bodies.impulse[pair[1]] += impulse
+            bodies.moment[pair[1]] += moment_b
+    warp_sync()
 
 
 @wp.kernel
@@ -264,9 +322,9 @@ def relax_kernel(
     constraints_inout: Constraints,
     bodies_inout: Bodies,
 ):
-    """Relax the pairs of a range of colors, color by color; the threads of the launch share those of a color.
+    """Relax the pairs of a range of colors, color by color; the warps of the launch share those of a color.
 
-    One thread relaxes the pairs without a color of their own.
+    One warp relaxes the pairs without a color of their own.
 
     Args:
         color, order: Colors in ascending order, and the pairs that have them.
@@ -276,13 +334,14 @@ def relax_kernel(
     room = order.shape[0] // 2
     backward = relaxation.backward
     colors = relaxation.last_color - relaxation.first_color + 1
+    warp = wp.tid() / warp_size()
     for step in range(colors):
         c = relaxation.first_color + point_of_turn(step, colors, backward)
         start = wp.lower_bound(color, 0, room, c)
         end = wp.lower_bound(color, 0, room, c + 1)
-        threads = wp.where(c == COLOR_COUNT, 1, relaxation.threads)
-        if wp.tid() < threads:
-            for turn in range(wp.tid(), end - start, threads):
+        warps = wp.where(c == COLOR_COUNT, 1, relaxation.warps)
+        if warp < warps:
+            for turn in range(warp, end - start, warps):
                 p = order[wp.where(backward != 0, end - 1 - turn, start + turn)]
                 if relaxation.stage != WARM_START:
                     relax_pair(relaxation, p, batch.pairs[p], manifolds, constraints_inout, bodies_inout)

@@ -15,6 +15,7 @@ from warp_abtree.checks.arguments import finite_array, flag, positive
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.base.arrays import LAST_KEY
+from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.bodies import bodies as body_kernels
 from warp_abtree.kernels.bodies import constraints as constraint_kernels
 from warp_abtree.kernels.bodies import graph_coloring, solve
@@ -31,9 +32,8 @@ GIVE = 0.25  # slops that springs may give for each body borne, unless that take
 REST_DEPTH, REST_APART = 0.5, 1.0  # at which points rest, in slops: deep, or with `continuous` apart, within reach
 CORRECTION = 0.2  # part of the penetration that a step corrects, however deep
 COLOR_ROUNDS = int(COLOR_COUNT)  # of the graph coloring
-LAST_COLORS = 8  # first of the last colors, which one block relaxes
-# Threads of a block: few pairs of a color lie on as many multiprocessors, and the last colors on one.
-RELAX_THREADS, TAIL_THREADS = 32, 256
+LAST_COLORS = 10  # first of the last colors, which one block relaxes
+TAIL_WARPS = 8  # of that block
 
 
 class Dynamics(RigidBodies):
@@ -91,7 +91,6 @@ class Dynamics(RigidBodies):
         self._least_slop = float(constraint_kernels.SLOP) * radii.min(initial=np.inf)
         # No body is in two pairs of a color.
         self._color_room = max(1, int(np.count_nonzero(self.rigid)))
-        self._tail_threads = TAIL_THREADS if self.device.is_cuda else 1
         self._warm_start = constraint_kernels.WarmStart()
         self._room, self._interrupted = -1, False
         self._grow()
@@ -251,7 +250,7 @@ class Dynamics(RigidBodies):
             wp.utils.radix_sort_pairs(self._sorted_color, self._sorted_pair, room, end_bit=7)
 
     def _relax(self, each, stage):
-        """Relax all pairs: by one thread in one launch, or a launch for each of the first colors.
+        """Relax all pairs: by one warp in one launch, or a launch for each of the first colors.
 
         The last colors have few pairs: a block relaxes them.
         """
@@ -260,14 +259,17 @@ class Dynamics(RigidBodies):
             self._relax_colors(each, range(COLOR_COUNT + 1), 1)
             return
         parts: list[tuple] = [([color], self._color_room) for color in range(LAST_COLORS)]
-        parts.append((range(LAST_COLORS, COLOR_COUNT + 1), self._tail_threads))
-        for colors, threads in reversed(parts) if each.backward else parts:
-            self._relax_colors(each, colors, threads)
+        parts.append((range(LAST_COLORS, COLOR_COUNT + 1), TAIL_WARPS))
+        for colors, warps in reversed(parts) if each.backward else parts:
+            self._relax_colors(each, colors, warps)
 
-    def _relax_colors(self, each, colors, threads):
-        each.first_color, each.last_color, each.threads = colors[0], colors[-1], threads
+    def _relax_colors(self, each, colors, warps):
+        if len(colors) > 1 and not self.device.is_cuda:
+            warps = 1  # blocks of one thread know no barrier
+        each.first_color, each.last_color, each.warps = colors[0], colors[-1], warps
         arrays = [self._sorted_pair, self._sorted_color, self.query.pair_batch, self.query.manifolds]
-        block = RELAX_THREADS if len(colors) == 1 else TAIL_THREADS
+        block = WARP_SIZE * (warps if len(colors) > 1 else 1)
+        threads = warps * (WARP_SIZE if self.device.is_cuda else 1)
         self._launch(solve.relax_kernel, threads, [each, *arrays, self.constraints, self.bodies], block)
 
 
@@ -289,7 +291,7 @@ class SteppedMotion:
         for module in (body_kernels, constraint_kernels, graph_coloring, solve):
             wp.load_module(module, device)
         if device.is_cuda:  # where a module is compiled for each size of blocks
-            wp.load_module(solve, device, block_dim=RELAX_THREADS)
+            wp.load_module(solve, device, block_dim=WARP_SIZE)
         self.aim(time)
         self.dynamics.find_contacts()
         if self.dynamics.certified is not None:

@@ -137,6 +137,14 @@ inline CUDA_CALLABLE wp::int32 value_of_lane(wp::int32 x, wp::int32 lane) {
 #endif
 }
 
+inline CUDA_CALLABLE wp::vec_t<3, wp::float64> vector64_of_lane(wp::vec_t<3, wp::float64> x, wp::int32 lane) {
+#if defined(__CUDA_ARCH__)
+    for (int k = 0; k < 3; ++k)
+        x[k] = __shfl_sync(0xffffffffu, x[k], lane);
+#endif
+    return x;
+}
+
 inline CUDA_CALLABLE wp::vec_t<3, wp::float32> vector_of_lane(wp::vec_t<3, wp::float32> x, wp::int32 lane) {
 #if defined(__CUDA_ARCH__)
     for (int k = 0; k < 3; ++k)
