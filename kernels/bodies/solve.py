@@ -33,15 +33,8 @@ RECOVERY = wp.constant(wp.float64(_FREQUENCY / _RESPONSE))
 SOFTNESS = wp.constant(wp.float64(1.0 / (1.0 + _FREQUENCY * _RESPONSE)))
 """Part of the impulse that it gives up."""
 
-VISITS_LEAST, VISITS_MAX, VISITS_EXTREME = wp.constant(3), wp.constant(8), wp.constant(64)
-"""How often the points of a pair are relaxed before the next pair; more than the least while speeds change much."""
-
-EXTREME = wp.constant(wp.float64(2.0**10))
-"""Times `fast` at which points meet that may be relaxed VISITS_EXTREME times: what is left of that speed is fast, too."""
-
-SETTLED = wp.constant(wp.float64(2.0**-6))
-SETTLED_IMPACT = wp.constant(wp.float64(2.0**-30))
-"""Change of speed that is not much: part of `fast`, or of the speed at which points meet."""
+VISITS_LEAST, VISITS_MAX = wp.constant(3), wp.constant(64)
+"""How often a pass relaxes the points of a pair before the next pair: once more for each doubling of a fast impact."""
 
 
 @wp.struct
@@ -213,8 +206,8 @@ def relax_pair(
 ):
     """Relax the points of a pair: the normal velocity, then the tangential one within the friction cone.
 
-    The points are relaxed several times, until they agree, one after the other: each by the lane of a warp that holds
-    it, while all lanes hold the motion of both objects. An impulse acts on both at one place: no momentum is lost. A
+    The points are relaxed several times, one after the other: each by the lane of a warp that holds it, while all lanes
+    hold the motion of both objects. An impulse acts on both at one place: no momentum is lost. A
     pair is struck if it meets fast where a pass begins.
     """
     stage, count, slop = relaxation.stage, manifolds.count[p], constraints.slop[p]
@@ -234,40 +227,39 @@ def relax_pair(
     fastest = warp_max(fastest)
     struck = wp.where(stage == RELAX, constraints.is_struck[p], 0)
     struck = wp.where(fastest > relaxation.fast, 1, struck)
-    settled = wp.max(SETTLED * relaxation.fast, SETTLED_IMPACT * fastest)
-    visits = wp.where(fastest > EXTREME * relaxation.fast, VISITS_EXTREME, VISITS_MAX)
-    visit = wp.int32(0)
-    while visit < visits:
-        change = wp.float64(0.0)
+    visits, rest_speed = wp.int32(VISITS_LEAST), wp.float64(fastest)
+    while rest_speed > relaxation.fast and visits < VISITS_MAX:
+        visits += 1
+        rest_speed *= HALF
+    for _visit in range(visits):
         for i in range(count):
             k = point_of_turn(i, count, relaxation.backward)
-            if warp_size() == 1:
-                point = load_point(rest, p, k, a, b, manifolds, constraints)
-            n = point.normal
-            velocity = relative_velocity(motion_a, motion_b, point.arm_a, point.arm_b)
-            excess = wp.dot(n, velocity) + approach_of(relaxation, corrects, slop, point.room)
-            soft = wp.where(corrects and point.room < ZERO and struck == 0, SOFTNESS, ZERO)
-            after = wp.max((ONE - soft) * (point.along - point.mass * excess), ZERO)
-            more = after - point.along
-            velocity += more * point.response
-            # What is still to come near has no friction yet.
-            most = wp.where(point.room > slop, ZERO, relaxation.friction * after)
-            wanted = friction_of(a, b, point, most, velocity - wp.dot(n, velocity) * n)
-            impulse = more * n + (wanted - point.across)
-            moment_a = vector64_of_lane(wp.cross(point.arm_a, impulse), k)
-            moment_b = vector64_of_lane(wp.cross(point.arm_b, impulse), k)
-            impulse = vector64_of_lane(impulse, k)
-            motion_a = push(a, motion_a, -impulse, -moment_a)
-            motion_b = push(b, motion_b, impulse, moment_b)
+            impulse = wp.vec3d()
+            moment_a = wp.vec3d()
+            moment_b = wp.vec3d()
             if warp_size() == 1 or resolve_lane() == k:
-                change = wp.max(change, wp.abs(more) / point.mass)
+                if warp_size() == 1:
+                    point = load_point(rest, p, k, a, b, manifolds, constraints)
+                n = point.normal
+                velocity = relative_velocity(motion_a, motion_b, point.arm_a, point.arm_b)
+                excess = wp.dot(n, velocity) + approach_of(relaxation, corrects, slop, point.room)
+                soft = wp.where(corrects and point.room < ZERO and struck == 0, SOFTNESS, ZERO)
+                after = wp.max((ONE - soft) * (point.along - point.mass * excess), ZERO)
+                more = after - point.along
+                velocity += more * point.response
+                # What is still to come near has no friction yet.
+                most = wp.where(point.room > slop, ZERO, relaxation.friction * after)
+                wanted = friction_of(a, b, point, most, velocity - wp.dot(n, velocity) * n)
+                impulse = more * n + (wanted - point.across)
+                moment_a = wp.cross(point.arm_a, impulse)
+                moment_b = wp.cross(point.arm_b, impulse)
                 point.along = after
                 point.across = wanted
                 constraints.impulse[p, k] = after
                 constraints.friction_impulse[p, k] = wanted
-        visit += 1
-        if visit >= VISITS_LEAST and warp_max(change) <= settled:
-            visit = visits
+            impulse = vector64_of_lane(impulse, k)
+            motion_a = push(a, motion_a, -impulse, -vector64_of_lane(moment_a, k))
+            motion_b = push(b, motion_b, impulse, vector64_of_lane(moment_b, k))
     if resolve_lane() == 0:
         constraints.is_struck[p] = struck
         store_motion(a, motion_a, bodies, pair[0])
