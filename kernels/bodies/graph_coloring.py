@@ -74,3 +74,22 @@ def assign_color_kernel(
         i = batch.pairs[p][k]
         if bodies_inout.motion_type[i] == DYNAMIC:
             bodies_inout.colors[i] = bodies_inout.colors[i] | (1 << color)
+
+
+@wp.kernel
+def find_color_kernel(color: wp.array(dtype=wp.int32), start_out: wp.array(dtype=wp.int32)):
+    """Find where the pairs of each color begin among pairs sorted by color, and where the last of them ends.
+
+    Args:
+        color: In ascending order, shape [2 pair]; its second half is scratch.
+    """
+    i = wp.tid()
+    room = color.shape[0] // 2
+    last = COLOR_COUNT + 1
+    before, here = wp.int32(-1), wp.int32(last)
+    if i > 0:
+        before = wp.min(color[i - 1], last)
+    if i < room:
+        here = wp.min(color[i], last)
+    for c in range(before + 1, here + 1):
+        start_out[c] = i

@@ -308,7 +308,7 @@ def hand_on_impulses(p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constrai
 def relax_kernel(
     relaxation: Relaxation,
     order: wp.array(dtype=wp.int32),
-    color: wp.array(dtype=wp.int32),
+    color_start: wp.array(dtype=wp.int32),
     batch: PairBatch,
     manifolds: Manifolds,
     constraints_inout: Constraints,
@@ -319,18 +319,16 @@ def relax_kernel(
     One warp relaxes the pairs without a color of their own.
 
     Args:
-        color, order: Colors in ascending order, and the pairs that have them.
+        order, color_start: Pairs sorted by color, and where those of each color begin.
     """
     if bodies_inout.is_whole[0] == 0:
         return
-    room = order.shape[0] // 2
     backward = relaxation.backward
     colors = relaxation.last_color - relaxation.first_color + 1
     warp = wp.tid() / warp_size()
     for step in range(colors):
         c = relaxation.first_color + point_of_turn(step, colors, backward)
-        start = wp.lower_bound(color, 0, room, c)
-        end = wp.lower_bound(color, 0, room, c + 1)
+        start, end = color_start[c], color_start[c + 1]
         warps = wp.where(c == COLOR_COUNT, 1, relaxation.warps)
         if warp < warps:
             for turn in range(warp, end - start, warps):

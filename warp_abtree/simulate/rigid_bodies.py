@@ -92,6 +92,7 @@ class Dynamics(RigidBodies):
         # No body is in two pairs of a color.
         self._color_room = max(1, int(np.count_nonzero(self.rigid)))
         self._warm_start = constraint_kernels.WarmStart()
+        self._color_start = wp.empty(int(COLOR_COUNT) + 2, dtype=wp.int32, device=self.device)
         self._room, self._interrupted = -1, False
         self._grow()
 
@@ -248,6 +249,7 @@ class Dynamics(RigidBodies):
         wp.copy(self._sorted_color, color, count=room)
         with wp.ScopedDevice(self.device):
             wp.utils.radix_sort_pairs(self._sorted_color, self._sorted_pair, room, end_bit=7)
+        self._launch(graph_coloring.find_color_kernel, room + 1, [self._sorted_color, self._color_start])
 
     def _relax(self, each, stage):
         """Relax all pairs: by one warp in one launch, or a launch for each of the first colors.
@@ -267,7 +269,7 @@ class Dynamics(RigidBodies):
         if len(colors) > 1 and not self.device.is_cuda:
             warps = 1  # blocks of one thread know no barrier
         each.first_color, each.last_color, each.warps = colors[0], colors[-1], warps
-        arrays = [self._sorted_pair, self._sorted_color, self.query.pair_batch, self.query.manifolds]
+        arrays = [self._sorted_pair, self._color_start, self.query.pair_batch, self.query.manifolds]
         block = WARP_SIZE * (warps if len(colors) > 1 else 1)
         threads = warps * (WARP_SIZE if self.device.is_cuda else 1)
         self._launch(solve.relax_kernel, threads, [each, *arrays, self.constraints, self.bodies], block)
