@@ -18,13 +18,11 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.func
 def distance_direction(v: wp.vec3d, d: wp.float64):
-    """Return the unit vector of a vector, its opposite where d < 0; zero where d is 0 or infinite, or there is none."""
+    """Return the unit vector of a vector, its opposite where d < 0; zero of points that coincide or are NaN."""
     size = largest_coordinate(v)
-    none = wp.float64(0.0)
-    # Of points that are NaN, too.
-    if not (size > none and size < wp.float64(wp.inf)) or d == none or wp.abs(d) == wp.float64(wp.inf):
+    if not (size > wp.float64(0.0) and size < wp.float64(wp.inf)):
         return wp.vec3d()
-    return wp.normalize(v / wp.where(d < none, -size, size))
+    return wp.normalize(v / wp.where(d < wp.float64(0.0), -size, size))
 
 
 @wp.kernel

@@ -30,7 +30,7 @@ class Distances:
     bracket: wp.array(dtype=wp.vec2d)  # proven lower and upper bound [world units]
     points: wp.array(dtype=two_points)  # nearest point of each, NaN where proved beyond [world units]
     faces: wp.array(dtype=wp.vec2i)  # the faces that they lie on, -1 where proved beyond
-    gradient: wp.array(dtype=two_twists)  # of the distance along translation and rotation vector of each, see `gradient`
+    gradient: wp.array(dtype=two_twists)  # by translation and rotation vector of each, see `gradient`
 
 
 @wp.func

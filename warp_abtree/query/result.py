@@ -89,8 +89,8 @@ class Result(DeviceMemory):
 
     On the device types are those that give the same NumPy array by `numpy()`: bool for any and apart, int64 for count
     and tests, vec2i for pairs and point_faces, vec3i for faces, vec2d and matrices of 2 rows for bracket, points and
-    gradient of distances. Contacts and summaries are dictionaries of one array a field, points of manifolds one of count, point,
-    normal and depth as `ManifoldQuery.manifolds`.
+    gradient of distances. Contacts and summaries are dictionaries of one array a field, points of manifolds one of
+    count, point, normal and depth as `ManifoldQuery.manifolds`.
 
     Attributes:
         pairs: Object pairs queried, int32 (p, 2).
@@ -156,8 +156,8 @@ class Result(DeviceMemory):
     def gradient(self) -> Any:
         """Derivatives of the distance, float64 (p, 2, 6), None unless output is "distance". May wait for the device.
 
-        With respect to the translation and the rotation vector [world axes] about its origin of the first object, and of
-        the second one; see `query.stages.distance`. Of a result on the host it stays on a GPU until it is first read.
+        With respect to translation and rotation vector, about its origin, of the first object and of the second, see
+        `query.stages.distance`. Of a result on the host it stays on a GPU until it is first read.
         """
         if self._gradient is not None and isinstance(self.pairs, np.ndarray):
             self._gradient = _to_host(self._gradient)
