@@ -61,8 +61,8 @@ def compare_fcl(meshes, poses, pairs, margin, query):
 
     matrices, answers = np.tile(np.eye(4), (len(poses), 1, 1)), []
     matrices[:, :3, 3] = poses[:, :3]
-    peer = FclSlopes(meshes, matrices)
-    ask = time_call(lambda: answers.append(peer.slopes(pairs, margin)), "cpu", time.thread_time)
+    other = FclSlopes(meshes, matrices)
+    ask = time_call(lambda: answers.append(other.slopes(pairs, margin)), "cpu", time.thread_time)
     times = sorted(ask() for _ in range(3))
     (distances, slopes), found = answers[0], query.run()
     near = (found.distance > 0) & (found.distance < margin)
