@@ -28,10 +28,11 @@ def sum_twists(i: wp.int32, pairs: ObjectPairs, weight: wp.array(dtype=wp.float6
     """Return translation and rotation part of the loss's gradient at an object, summed in the order of its pairs."""
     along, turn = wp.vec3d(), wp.vec3d()
     for k in range(pairs.start[i], pairs.start[i + 1]):
-        pair, side = pairs.entry[k] >> 1, pairs.entry[k] & 1
+        pair, is_second = pairs.entry[k] >> 1, (pairs.entry[k] & 1) == 1
+        both, factor = twist[pair], weight[pair]
         for j in range(3):
-            along[j] += weight[pair] * twist[pair][side, j]
-            turn[j] += weight[pair] * twist[pair][side, 3 + j]
+            along[j] += factor * wp.where(is_second, both[1, j], both[0, j])
+            turn[j] += factor * wp.where(is_second, both[1, 3 + j], both[0, 3 + j])
     return along, turn
 
 
