@@ -297,7 +297,7 @@ def draw_places():
         for poses, when in ((sample["first"], "at first"), (end, f"after {sample['step']} steps")):
             objects = range(world * size, (world + 1) * size)
             panels.append(panel_of(scene, f"world {world}, {when}", poses, objects=objects))
-    legend = [(COLOURS[0][1], "faces that intersect")]
+    legend = [(COLOURS[0][1], "in bright colours: faces that intersect")]
     file, title = "sample_place_without_overlap.png", "Descent along the gradient of the sum of overlaps"
     draw(panels, FOLDER / file, title, legend, (0.5, -1, 0.6), (0, 0, 1), 300)
 
