@@ -288,6 +288,20 @@ def draw_simulator():
     draw(panels, FOLDER / "sample_in_a_simulator.png", title, legend, (0.5, -1, 0.5), (0, 0, 1), 330)
 
 
+def draw_places():
+    """Two worlds at the start of the descent and at its end."""
+    sample = run_sample("07_place_without_overlap")
+    scene, size, end = sample["scene"], sample["size"], sample["scene"].poses
+    panels = []
+    for world in range(2):
+        for poses, when in ((sample["first"], "at first"), (end, f"after {sample['step']} steps")):
+            objects = range(world * size, (world + 1) * size)
+            panels.append(panel_of(scene, f"world {world}, {when}", poses, objects=objects))
+    legend = [(COLOURS[0][1], "in bright colours: faces that intersect")]
+    file, title = "sample_place_without_overlap.png", "Descent along the gradient of the sum of overlaps"
+    draw(panels, FOLDER / file, title, legend, (0.5, -1, 0.6), (0, 0, 1), 300)
+
+
 def main():
     draw_lods()
     draw_trees()
@@ -298,6 +312,7 @@ def main():
     draw_way_out()
     draw_which_lod()
     draw_simulator()
+    draw_places()
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ answer a pose from which `face_pairs` reads all intersecting face pairs. Without
 """
 
 import numpy as np
+from trimesh.transformations import rotation_matrix
 
 ALL_CONTACTS = 2**31 - 1
 
@@ -119,6 +120,56 @@ class FclRobot:
             part.setTransform(self.fcl.Transform(matrix[:3, :3], matrix[:3, 3]))
         request = self.fcl.CollisionRequest()
         return any(self.fcl.collide(a, b, request, self.fcl.CollisionResult()) for a, b in self.pairs)
+
+
+class FclSlopes:
+    """python-fcl, asked for gradients of the overlap max(margin - d, 0) of pairs, by differences along one's motions.
+
+    Where meshes intersect, d is minus the depth of the deepest contact: FCL has no signed distance of meshes.
+
+    Args:
+        meshes: (vertices, faces) of each object.
+        matrices: Poses of the objects, float64 (n, 4, 4).
+    """
+
+    def __init__(self, meshes, matrices):
+        import fcl
+
+        self.fcl, self.matrices = fcl, matrices
+        trees = {id(mesh): make_tree(*mesh) for mesh in meshes}
+        self.objects = [fcl.CollisionObject(trees[id(mesh)], fcl.Transform()) for mesh in meshes]
+        for thing, matrix in zip(self.objects, matrices):
+            self._place(thing, matrix)
+        self.all = fcl.CollisionRequest(num_max_contacts=ALL_CONTACTS, enable_contact=True)
+
+    def _place(self, thing, matrix):
+        thing.setTransform(self.fcl.Transform(matrix[:3, :3], matrix[:3, 3]))
+
+    def distance(self, i, j):
+        """Return the distance of two objects, minus a depth where they intersect."""
+        a, b, result = self.objects[i], self.objects[j], self.fcl.CollisionResult()
+        distance = self.fcl.distance(a, b, self.fcl.DistanceRequest(), self.fcl.DistanceResult())
+        if distance > 0:
+            return distance
+        self.fcl.collide(a, b, self.all, result)
+        return -max((contact.penetration_depth for contact in result.contacts), default=0.0)
+
+    def slopes(self, pairs, margin, step=1e-6):
+        """Return distances (p,), and how each changes by the motions of the second object (p, 6), 0 beyond margin."""
+        distances, slopes = np.empty(len(pairs)), np.zeros((len(pairs), 6))
+        turns = [rotation_matrix(step, axis)[:3, :3] for axis in np.eye(3)]
+        for p, (i, j) in enumerate(pairs):
+            distances[p] = self.distance(i, j)
+            for axis in range(6 if distances[p] < margin else 0):
+                moved = self.matrices[j].copy()
+                if axis < 3:
+                    moved[axis, 3] += step
+                else:
+                    moved[:3, :3] = turns[axis - 3] @ moved[:3, :3]
+                self._place(self.objects[j], moved)
+                slopes[p, axis] = (self.distance(i, j) - distances[p]) / step
+            self._place(self.objects[j], self.matrices[j])
+        return distances, slopes
 
 
 class Trimesh:

@@ -19,6 +19,7 @@ wp.set_module_options(native.options())
 LEAST_DISTANCE = wp.constant(wp.float64(2.0**-1022))
 
 two_points = wp.types.matrix(shape=(2, 3), dtype=wp.float64)
+two_twists = wp.types.matrix(shape=(2, 6), dtype=wp.float64)
 
 
 @wp.struct
@@ -29,6 +30,7 @@ class Distances:
     bracket: wp.array(dtype=wp.vec2d)  # proven lower and upper bound [world units]
     points: wp.array(dtype=two_points)  # nearest point of each, NaN where proved beyond [world units]
     faces: wp.array(dtype=wp.vec2i)  # the faces that they lie on, -1 where proved beyond
+    gradient: wp.array(dtype=two_twists)  # by translation and rotation vector of each, see `gradient`
 
 
 @wp.func

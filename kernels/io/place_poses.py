@@ -19,9 +19,9 @@ def is_finite(x: wp.vec3d):
 
 @wp.func
 def is_unit(tolerance: wp.float64, q: wp.vec4d):
-    """Return whether the norm of a quaternion is off 1 by no more than a tolerance; false for NaN."""
+    """Return whether the norm of a quaternion is over 0, and off 1 by no more than a tolerance; false for NaN."""
     norm = wp.sqrt(((q[0] * q[0] + q[1] * q[1]) + q[2] * q[2]) + q[3] * q[3])
-    return wp.abs(norm - wp.float64(1.0)) <= tolerance
+    return norm > wp.float64(0.0) and wp.abs(norm - wp.float64(1.0)) <= tolerance
 
 
 @wp.func

@@ -172,6 +172,12 @@ def check_points(rows):
         assert row["one_ratio"] == pytest.approx(row["one_ms"] / row["faces_ms"], rel=0.02)
 
 
+def check_gradients(rows):
+    (row,) = rows
+    assert row["pairs"] == 56 > row["near"] >= row["overlapping"] > 5
+    assert row.get("fcl_differ", 0) == 0 and row.get("fcl_agree", 1) == 1
+
+
 def check_robot(rows):
     assert [row["output"] for row in rows] == ["any", "distance", "distance", "edges"]
     assert rows[0]["differ_from_fcl"] == 0 and 0 < rows[0]["meet"] < 1 and rows[3]["clear"] > 0

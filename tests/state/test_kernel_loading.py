@@ -129,7 +129,7 @@ def test_an_error_ahead_is_said_by_the_launch(device, monkeypatch):
 
 
 # Modules of the first answer about two small models: on threads of the CPU, and on warps.
-MODULES = {"any": (6, 11), "faces": (6, 12), "contacts": (9, 14), "distance": (5, 13)}
+MODULES = {"any": (6, 11), "faces": (6, 12), "contacts": (9, 14), "distance": (6, 14)}
 
 
 @pytest.mark.parametrize("output", MODULES)

@@ -73,6 +73,7 @@ class Found:
     distance: Any = None
     bracket: Any = None
     point_faces: Any = None
+    gradient: Any = None
     time: Any = None
     clear: Any = None
     undecided: Any = None
@@ -87,9 +88,9 @@ class Result(DeviceMemory):
     tests among them, from a GPU into page-locked memory that is used again when no array of the result is left.
 
     On the device types are those that give the same NumPy array by `numpy()`: bool for any and apart, int64 for count
-    and tests, vec2i for pairs and point_faces, vec3i for faces, vec2d and matrices of 2 rows for bracket and points of
-    distances. Contacts and summaries are dictionaries of one array a field, points of manifolds one of count, point,
-    normal and depth as `ManifoldQuery.manifolds`.
+    and tests, vec2i for pairs and point_faces, vec3i for faces, vec2d and matrices of 2 rows for bracket, points and
+    gradient of distances. Contacts and summaries are dictionaries of one array a field, points of manifolds one of
+    count, point, normal and depth as `ManifoldQuery.manifolds`.
 
     Attributes:
         pairs: Object pairs queried, int32 (p, 2).
@@ -144,11 +145,23 @@ class Result(DeviceMemory):
         held = vars(found)
         vars(self).update({name: held[name] for name in RESULT_ARRAYS}, **found.tests)
         self.count: Any = found.count if output != "any" else None
+        self._gradient = found.gradient
         self._totals, self._room, self._names = found.totals, room, names
 
     def __repr__(self):
         held = [name for name in (*RESULT_ARRAYS[1:], "count") if getattr(self, name) is not None]
         return f"Result(pairs={len(self.pairs)}, {', '.join(held)})"
+
+    @property
+    def gradient(self) -> Any:
+        """Derivatives of the distance, float64 (p, 2, 6), None unless output is "distance". May wait for the device.
+
+        With respect to translation and rotation vector, about its origin, of the first object and of the second, see
+        `query.stages.distance`. Of a result on the host it stays on a GPU until it is first read.
+        """
+        if self._gradient is not None and isinstance(self.pairs, np.ndarray):
+            self._gradient = _to_host(self._gradient)
+        return self._gradient
 
     def __len__(self):
         """Return the number of pairs."""
@@ -161,6 +174,8 @@ class Result(DeviceMemory):
     def __reduce_ex__(self, protocol):
         """Pickle or copy what lies on the host; refuse arrays on the device."""
         on_host = isinstance(self.pairs, np.ndarray)
+        if on_host:
+            _ = self.gradient
         return object.__reduce_ex__(self, protocol) if on_host else super().__reduce_ex__(protocol)
 
     def check(self):
@@ -184,8 +199,8 @@ class Result(DeviceMemory):
     def rows(self) -> list[dict[str, Any]]:
         """Return a dict a pair: names of its objects, "first" and "second", and its answers. Waits for the device.
 
-        Answers are Python's numbers and lists, by the names of the result's arrays and of `pair_contacts`; what has an
-        entry a face pair or contact point is left out.
+        Answers are Python's numbers and lists, by the names of the result's arrays and of `pair_contacts`; gradients,
+        and what has an entry a face pair or contact point, are left out.
         """
         columns = {name: values.tolist() for name, values in self._pair_arrays()}
         return [dict(zip(columns, row)) for row in zip(*columns.values())]

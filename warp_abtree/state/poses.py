@@ -8,6 +8,8 @@ from warp_abtree.kernels.io import place_poses
 
 QUATERNION_TOLERANCE = 1e-3
 RIGID_TOLERANCE = 1e-6
+# As a tolerance of quaternions: those of any norm but 0 are normalised.
+ANY_NORM = 1e308
 # A matrix that is no farther off was rigid before rounding, for all that its numbers tell.
 ROUNDED_AT_MOST = 1e-2
 
@@ -85,14 +87,17 @@ def device_rows(poses, device, what="poses"):
     if not device.is_cuda or not is_device_array(poses):
         return None
     array = wrap_array(poses, what)
-    if array.device != device:
-        return None
+    return view_rows(array) if array.device == device else None
+
+
+def view_rows(array: wp.array):
+    """Return poses as rows of 7 or 16 numbers, without a copy where they are contiguous; None where they are none."""
     if array.ndim == 1 and array.dtype in POSE_TYPES:
         scalar, width = POSE_TYPES[array.dtype]
         array = array if array.is_contiguous else array.contiguous()
-        shape = (len(array), width)
+        at = {"ptr": array.ptr, "shape": (len(array), width), "device": array.device}
         # The deleter holds the owner of the memory until the rows go.
-        return wp.array(ptr=array.ptr, dtype=scalar, shape=shape, device=device, deleter=lambda *_, owner=array: None)
+        return wp.array(dtype=scalar, deleter=lambda *_, owner=array: None, **at)
     quaternions = array.ndim == 2 and array.shape[1] == 7
     if array.dtype not in REALS or not (quaternions or array.shape[1:] == (4, 4)):
         return None
@@ -100,15 +105,18 @@ def device_rows(poses, device, what="poses"):
     return array if array.ndim == 2 else array.reshape((array.shape[0], 16))
 
 
-def place_rows(rows, pool):
+def place_rows(rows, pool, tolerance=QUATERNION_TOLERANCE):
     """Check rows of `device_rows` on the device and set the objects of a pool from them. (synchronization point)
+
+    Args:
+        tolerance: That quaternions may be off unit length by.
 
     Raises:
         ValueError: As `check_poses`; nothing is changed.
     """
     matrices = rows.shape[1] == 16
     first = wp.full(1, NONE_BAD, dtype=wp.int32, device=rows.device)
-    inputs = [wp.float64(RIGID_TOLERANCE if matrices else QUATERNION_TOLERANCE), rows, first]
+    inputs = [wp.float64(RIGID_TOLERANCE if matrices else tolerance), rows, first]
     wp.launch(place_poses.pose_check(rows.dtype, rows.shape[1]), len(rows), inputs, device=rows.device)
     bad = int(first.numpy()[0])
     if bad != NONE_BAD:
@@ -117,7 +125,8 @@ def place_rows(rows, pool):
         raise ValueError(f"poses: pose {bad} is no pose")  # by rounding, where the host finds it just within
     launch_place(rows, pool)
     # Whose memory it is may free or change it as soon as this returns, on another stream.
-    wp.synchronize_stream(wp.get_stream(rows.device))
+    if rows.device.is_cuda:
+        wp.synchronize_stream(wp.get_stream(rows.device))
 
 
 class HostPoses:

@@ -14,6 +14,11 @@ names its objects:
   two faces share, as accurate as a contact (`query.stages.contacts`).
 * point_faces: the faces that they lie on. Of equally near face pairs the one with the lowest face of the object with
   the smaller index, then of the other; where the surfaces intersect, some pair that does.
+* gradient: the derivative of the distance with respect to the translation [-] and the rotation vector [world units]
+  about its origin, world axes, of the first object and of the second: of both nearest points as if they stayed on their
+  objects, (-n, -(p - c) x n) and (n, (q - c) x n), n the unit vector from the first to the second. Where other points
+  are as near it is an element of the generalised gradient (Clarke's), between the slopes to either side. Zero where the
+  distance is 0, or infinite, as it is where it stays so; touching surfaces are also a minimum of the distance there.
 
 With `signed`, a pair of which one object lies inside the other, a solid (`Scene.add`), by some of its points has a
 negative distance. The depth of a point is its distance from the other's surface; looked at are corners of faces,
@@ -22,6 +27,7 @@ middles of edges and centroids of faces, of both objects if both are solids. The
 * distance is minus the depth; bracket holds it as above.
 * points are the point inside and the point of the other surface that is nearest to it, in the order of the pair, and
   point_faces the faces that they lie on. From the point inside to the other is its way out.
+* gradient as above, n then the other way, so that its opposite leads out; zero where distance is 0.
 
 Depth is a lower bound of the penetration depth, the length of the shortest motion that frees the objects, however many
 faces are submerged, and that length for a body pressed into a flat floor or a peg that is too thick for its hole. Where
@@ -45,7 +51,7 @@ from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_core
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.base.lanes import WARP_SIZE
-from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd
+from warp_abtree.kernels.distance import crossing, frame, gradient, report, search, search_simd
 from warp_abtree.kernels.inside.containment import report_contained_kernel
 from warp_abtree.kernels.inside.depth import find_depth_kernel
 from warp_abtree.kernels.search import mean_slabs
@@ -145,6 +151,7 @@ class DistanceStage(Stage):
         kernels = [search.search_warp_kernel if with_warps else search_simd.search_thread_kernel]
         kernels += CROSSING_KERNELS if device.is_cuda and self._with_points else []  # on the CPU where pairs cross
         kernels += [report.report_distance_kernel, frame.start_distance_kernel] if with_warps else []
+        kernels += [gradient.find_gradient_kernel] if self._with_points else []
         making = [(mean_slabs.make_slabs_kernel, mean_slabs.SLAB_THREADS)] if with_warps else []
         return [*[(kernel, WARP_SIZE) for kernel in kernels], *making]
 
@@ -159,6 +166,7 @@ class DistanceStage(Stage):
             Array(found, "upper", wp.vec2, pairs if warps else 0),
             *fields(self.distances, pairs, distance=wp.float64, bracket=wp.vec2d),
             *fields(self.distances, pairs, points=report.two_points, faces=wp.vec2i),
+            *fields(self.distances, pairs if self._with_points else 0, gradient=report.two_twists),
             Array(self.slabs, "states", wp.vec2i, pairs),
             Array(self, "memory", wp.float32, (threads, search_simd.NEAREST_WORDS)),
             *self._slab_arrays(),
@@ -214,6 +222,9 @@ class DistanceStage(Stage):
             operator.launch_all("crossings", self._make_crossings)
         if operator.batch.solids is not None and self._inside is not None:
             operator.launch_all("inside", self._make_inside)
+        if self._with_points:
+            inputs = [operator.batch.trees, operator.pair_batch, self.distances]
+            operator.launch_kernel(gradient.find_gradient_kernel, operator.rooms.pairs, inputs, WARP_SIZE)
 
     def _cores(self) -> int:
         """Return how many cores share the search; a graph of the CPU has one."""
@@ -278,7 +289,7 @@ class DistanceStage(Stage):
     def read(self, found: Found, device: bool, with_rows: bool):
         """Read the distances."""
         n, on_host = len(found.pairs), self.operator.device.is_cpu and not device
-        for name in (*DISTANCES, "points"):
+        for name in ("gradient", *DISTANCES, "points"):
             rows = getattr(self.distances, ANSWER_FIELDS.get(name, name))
             if on_host:
                 if name not in self._views:
@@ -286,7 +297,9 @@ class DistanceStage(Stage):
                 setattr(found, name, self._views[name][:n].copy())
                 continue
             rows = rows if len(rows) == n else first_rows(rows, n)
-            setattr(found, name, wp.clone(rows) if device else rows.numpy().copy())
+            # The largest part, which few ask for, comes to the host when it is read: see `Result.gradient`.
+            stays = device or name == "gradient"
+            setattr(found, name, wp.clone(rows) if stays else rows.numpy().copy())
 
 
 class DistanceQuery(Operator):

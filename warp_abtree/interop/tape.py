@@ -1,0 +1,122 @@
+"""Distances of object pairs as a differentiable function of all poses, for `wp.Tape`."""
+
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import check_device, wrap_array
+from warp_abtree.kernels.io.pose_gradients import ObjectPairs, gradient_adder
+from warp_abtree.query.stages.distance import DistanceQuery
+from warp_abtree.query.staging import first_rows
+from warp_abtree.state.poses import ANY_NORM, place_rows, view_rows
+
+# Of each query the pairs that it was given, and where each object stands in them.
+_pairs_of: WeakKeyDictionary = WeakKeyDictionary()
+
+
+def pose_rows(poses, query: DistanceQuery) -> wp.array:
+    """Return poses of all objects as rows of 7 or 16 numbers on the query's device, without a copy.
+
+    Raises:
+        ValueError: Another type, shape, number or device, or memory with gaps.
+    """
+    array = wrap_array(poses, "poses")
+    if array.device != query.device:
+        raise ValueError(f"poses: on {array.device}, the query is on {query.device}")
+    rows, count = view_rows(array), len(query.batch.objects.state)
+    if rows is None or not array.is_contiguous:
+        kind = getattr(array.dtype, "__name__", array.dtype)
+        raise ValueError(f"poses: shape {array.shape} of {kind} is no contiguous (n, 7) or (n, 4, 4) of floats")
+    if len(rows) != count:
+        raise ValueError(f"poses: {len(rows)} given for {count} objects")
+    return rows
+
+
+class PosedDistances:
+    """Distances of a query's pairs at poses of all objects, and what the gradients by the poses need.
+
+    The objects stay at these poses. Waits for the device.
+
+    Args:
+        query: `DistanceQuery` that was given its pairs.
+        rows: Poses as `pose_rows` returns them, which have to stay; quaternions of any norm but 0.
+
+    Attributes:
+        distance: Device float64 (p,).
+        gradient: As `Result.gradient`, on the device.
+
+    Raises:
+        TypeError: Another query.
+        ValueError: A query that runs the broad phase; or a pose is none, and no object has moved.
+        RuntimeError: A graph is being captured, or as `DistanceQuery.launch`.
+    """
+
+    def __init__(self, query: DistanceQuery, rows: wp.array):
+        check_device(query.device, "pair_distance (PoseInput and DistanceQuery.launch can)")
+        query.check_scene()
+        place_rows(rows, query.batch.objects.pool, ANY_NORM)
+        query.grow()
+        count, found = len(query.given), query.distances
+        self.rows, self._pairs = rows, find_object_pairs(query)
+        self.distance, self.gradient = (wp.clone(first_rows(a, count)) for a in (found.distance, found.gradient))
+
+    def add_gradient(self, weight: wp.array, rows: wp.array):
+        """Add the gradient of a loss by the poses to rows like those given; weight is the loss's by the distances.
+
+        Sums are taken in float64 and in the order of the pairs. Launches only.
+        """
+        kernel = gradient_adder(rows.dtype, rows.shape[1])
+        inputs = [self._pairs, weight, self.gradient, self.rows, rows]
+        wp.launch(kernel, len(rows), inputs, device=rows.device, record_tape=False)
+
+
+def check_query(query: Any):
+    """Raise where `PosedDistances` refuses a query."""
+    if not isinstance(query, DistanceQuery):
+        raise TypeError(f"query: a DistanceQuery is expected, not a {type(query).__name__}")
+    if query.given is None:
+        raise ValueError("query: its pairs come from the broad phase; make it with pairs, such as scene.broad_phase()")
+
+
+def find_object_pairs(query: DistanceQuery) -> ObjectPairs:
+    """Return the pairs that each object of a query is in, made anew where it was given others."""
+    given, found = _pairs_of.get(query, (None, None))
+    if given is not query.given:
+        objects = query.given.ravel()
+        found = ObjectPairs()
+        entry = np.argsort(objects, kind="stable").astype(np.int32)
+        start = np.searchsorted(objects[entry], np.arange(len(query.batch.objects.state) + 1)).astype(np.int32)
+        found.entry, found.start = (wp.array(a, dtype=wp.int32, device=query.device) for a in (entry, start))
+        _pairs_of[query] = query.given, found
+    return found
+
+
+def record_pair_distance(tape: wp.Tape, query: DistanceQuery, poses: wp.array) -> wp.array:
+    """Place all objects, launch a query, and record it on a tape. Waits for the device.
+
+    Args:
+        tape: Whose `backward` adds the gradient to `poses.grad`, on the device.
+        query: `DistanceQuery` that was given its pairs; signed, if depths are to count.
+        poses: With a gradient, of all objects: (n, 7) with quaternions of any norm but 0, or (n, 4, 4), float32 or
+            float64, or Warp's transforms or matrices (n,).
+
+    Returns:
+        Distances, float64 (p,), with a gradient. That by a quaternion is of the normalised one, and that by a matrix
+        within the rigid motions.
+
+    Raises:
+        TypeError, ValueError, RuntimeError: As `PosedDistances`; or poses of another shape, count, type or device, or
+            without a gradient. No object has moved.
+    """
+    check_query(query)
+    if not isinstance(poses, wp.array) or poses.grad is None:
+        raise ValueError("poses: a Warp array made with requires_grad=True is expected")
+    rows, recorded = pose_rows(poses, query), len(tape.launches)
+    posed = PosedDistances(query, rows)
+    del tape.launches[recorded:]  # the query's own, where the tape is recording
+    distance = posed.distance
+    distance.requires_grad = True
+    tape.record_func(lambda: posed.add_gradient(distance.grad, pose_rows(poses.grad, query)), [poses, distance])
+    return distance
