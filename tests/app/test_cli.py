@@ -119,10 +119,10 @@ def test_query_against_the_library(files, capsys):
     assert shown.endswith("distance                farther than 2.5\n") and "points" not in shown
     apart = answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--output", "contacts")
     nowhere = [None, None, None]
-    assert apart["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere, "travel": 0}
+    assert apart["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere}
     assert apart["count"] == 0 and apart["faces"] == apart["contacts"] == []
     shown, _ = run(capsys, "query", *asked[:10], "--output", "contacts", "--device", "cpu")
-    assert "pair contacts           count 0, point none, normal none, travel 0\n" in shown and "nan" not in shown
+    assert "pair contacts           count 0, point none, normal none\n" in shown and "nan" not in shown
     shown, _ = run(capsys, "query", "ball.obj", "ring.ply", "--output", "contacts", "--device", "cpu")
     assert "intersects              yes\n" in shown and len(re.findall(r"^\d+ +\d+$", shown, re.M)) == report.LISTED
     assert re.search(r"^and \d+ more; --json lists all$", shown, re.M) and "face_a  face_b  p0" in shown

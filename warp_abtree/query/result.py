@@ -43,7 +43,7 @@ def _record_types(real, with_gap):
     vectors: list = [(name, real, (3,)) for name in VECTORS]
     if with_gap:
         vectors.append(("separation", real))
-    means = [("point", real, (3,)), ("normal", real, (3,)), ("travel", real)]
+    means = [("point", real, (3,)), ("normal", real, (3,))]
     return np.dtype([*indices, *vectors, ("coplanar", bool)]), np.dtype([("count", np.int64), *means])
 
 
