@@ -109,7 +109,7 @@ class ContactStage(Stage):
         # As many of one and of the other as there are contacts at most: one array has room for both.
         self._listed_totals = wp.zeros(2, dtype=wp.int32, device=operator.device)
         self.deferred.total, self._near.total = self._listed_totals[:1], self._listed_totals[1:]
-        self.sort = HitSort(operator)
+        self.sort = HitSort(self.operator)
 
     def kernels(self, device) -> list:
         """Return what finds contacts, and what sorts."""
