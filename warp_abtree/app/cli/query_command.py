@@ -20,7 +20,7 @@ from warp_abtree.scene.scene import Scene
 SUMMARY = "intersect two meshes, A at the origin and B at a pose, or all objects of a scene"
 EXAMPLES = (
     "warp:bear warp:bunny --pose 2 2 0 0 0 0 1",
-    "assembly.glb --output distance --beyond 2 --record pairs.csv",
+    "bunny_tori --output distance --beyond 0.2 --record pairs.csv",
     "bunny.npz bunny.npz --pose -0.5 0 0 0 0 0 1 --lod-a 0.25 --lod-b tol:0.01 --output faces --json",
     "bunny.npz bunny.npz --pose 0.2 0 0 0 0 0 1 --output contacts --record contacts.csv",
     "bunny.npz bunny.npz --pose 2 0 0 0 0 0 1 --output distance --json",
