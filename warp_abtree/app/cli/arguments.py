@@ -92,5 +92,5 @@ class PrintCompletion(argparse.Action):
         bash = f'compgen -W "{scenes}" -- "$1"; compgen -f -- "$1"'
         bodies = {"bash": bash, "zsh": f"_alternative 'scenes:scene:({scenes})' 'files:file:_files'"}
         preamble = {shell: f"{SCENES_FUNCTION}() {{ {body}; }}" for shell, body in bodies.items()}
-        print(shtab.complete(parser, values, preamble=preamble))
+        print(shtab.complete(parser, values, preamble=preamble.get(values, "")))
         parser.exit()
