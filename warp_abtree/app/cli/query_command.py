@@ -16,6 +16,7 @@ from warp_abtree.interop.scenes import is_assembly
 from warp_abtree.model.files.found import MeshError
 from warp_abtree.query.result import RESULT_ARRAYS
 from warp_abtree.scene.scene import Scene
+from warp_abtree.state.poses import IDENTITY_POSE
 
 SUMMARY = "intersect two meshes, A at the origin and B at a pose, or all objects of a scene"
 EXAMPLES = (
@@ -27,7 +28,6 @@ EXAMPLES = (
     "bunny.npz bunny.npz --pose 2 0 0 0 0 0 1 --lod-a 0.1 --lod-b 0.1 --output distance --relative 0.05 --originals",
 )
 OUTPUTS = ("any", "count", "faces", "contacts", "distance")
-IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 DISTANCE_OPTIONS = ("tolerance", "relative", "beyond", "originals", "signed")
 
 
