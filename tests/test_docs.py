@@ -99,6 +99,13 @@ def test_scenes_in_pages_load(page):
         assert rows[-1].objects == loaded.scene.object_count > 1
 
 
+def test_keys_of_scene_files_are_listed_as_they_are():
+    """`python docs/scene_reference.py` writes the page."""
+    pytest.importorskip("msgspec")
+    made = runpy.run_path(str(ROOT / "docs" / "scene_reference.py"))["make_page"]()
+    assert made == (ROOT / "docs" / "scene_keys.md").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_links_lead_somewhere(page):
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)

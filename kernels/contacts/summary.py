@@ -10,16 +10,14 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees, no_vector
-from warp_abtree.kernels.base.lanes import add_in_order, six_numbers, warp_any, warp_lane, warp_max, warp_size
+from warp_abtree.kernels.base.lanes import add_in_order, six_numbers, warp_lane, warp_size
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.contacts.contact import (
     SHORTEST_NORMAL,
     Contacts,
-    contact_objects,
     have_crossed,
     pair_direction,
 )
-from warp_abtree.kernels.contacts.travel import choose_travel, loop_change, reach_contacts
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
 wp.set_module_options(native.options("base/lanes.cuh", "contacts/contact_sums.h"))
@@ -68,23 +66,17 @@ class PairContacts:
 
     point: wp.array(dtype=wp.vec3d)  # mean point [world units]
     normal: wp.array(dtype=wp.vec3d)  # unit mean normal
-    travel: wp.array(dtype=wp.float64)  # [world units]
 
 
 @wp.struct
 class ChunkSums:
-    """Sums over each chunk, and data of a pair that its chunks share."""
+    """Sums over each chunk."""
 
     span: wp.array(dtype=wp.vec3i)  # (pair, first contact, end), shape [chunk]; nothing behind the last pair's
     length: wp.array(dtype=wp.float64)  # sum of lengths, shape [chunk]
     point: wp.array(dtype=wp.vec3d)  # weighted, from the pair's first end, shape [chunk]
     normal: wp.array(dtype=wp.vec3d)  # weighted, shape [chunk]
-    area: wp.array(dtype=wp.float64)  # that the contact curve encloses, shape [chunk]
-    change: wp.array(dtype=wp.float64)  # how fast the area changes, shape [chunk]
-    front: wp.array(dtype=wp.float64)  # how far the first object's faces reach along the normal, shape [chunk]; or NaN
-    back: wp.array(dtype=wp.float64)  # how far the second's reach against it, shape [chunk]
     crossed: wp.array(dtype=wp.float64)  # contacts whose faces intersect, shape [chunk]
-    middle: wp.array(dtype=wp.vec3d)  # mean point from the first end, shape [pair]
 
 
 @wp.func
@@ -190,111 +182,32 @@ def mean_normal(trees: Trees, pair: wp.vec2i, sum: wp.vec3d):
     return unit_vector(n)
 
 
-@wp.kernel(cuda_max_registers=96)
-def sum_loop_kernel(
-    trees: Trees,
-    batch: PairBatch,
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    contacts: Contacts,
-    sums_inout: ChunkSums,
-    pair_contacts_out: PairContacts,
-):
-    """Sum the terms of the travel of one chunk a warp: area within the contact curve, its change, extents of faces.
-
-    Extents serve pairs without an area, which as a rule have none in any chunk: others are left out.
-    """
-    c = wp.tid() / warp_size()
-    if c >= first_chunk(start.shape[0] - 1, start):
-        return
-    span = sums_inout.span[c]
-    if span[1] >= span[2]:
-        return
-    p = span[0]
-    origin = contacts.p0[start[p]]
-    middle, normals = sum_means(p, start, sums_inout)
-    n = mean_normal(trees, batch.pairs[p], normals)
-    sums = six_numbers()
-    first = wp.int32(span[1])
-    while first < span[2]:
-        k = wp.min(first + warp_lane(), span[2] - 1)
-        # About the mean point, since for an open curve the area depends on where it is measured from.
-        r = contacts.p0[k] - origin - middle
-        s = contacts.p1[k] - contacts.p0[k]
-        parts = six_numbers()
-        if contacts.coplanar[k] == 0 and have_crossed(contacts, k):
-            parts[0] = wp.float64(0.5) * wp.dot(n, wp.cross(r, s))
-            parts[1] = loop_change(s, contacts.normal_a[k], contacts.normal_b[k], n)
-        sums = add_in_order(sums, parts, wp.min(span[2] - first, warp_size()))
-        first += warp_size()
-    front = wp.float64(wp.nan)
-    back = wp.float64(wp.nan)
-    if sums[0] == wp.float64(0.0):
-        own = contact_objects(batch, p)
-        front, back = reach_contacts(trees, own, batch.poses[p], span, faces, contacts, n, origin)
-    if warp_lane() == 0:
-        sums_inout.area[c] = sums[0]
-        sums_inout.change[c] = sums[1]
-        sums_inout.front[c] = front
-        sums_inout.back[c] = back
-        if c == first_chunk(p, start):
-            sums_inout.middle[p] = middle
-            pair_contacts_out.normal[p] = n
-
-
-@wp.func
-def sum_chunks(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
-    """Sum a pair's chunks: area, its change, extents of faces along the normal, and whether all have these."""
-    all = six_numbers()
-    front = -wp.float64(wp.inf)
-    back = -wp.float64(wp.inf)
-    measured = bool(True)
-    c = first_chunk(p, start)
-    end = end_chunk(p, start)
-    while c < end:
-        k = wp.min(c + warp_lane(), end - 1)
-        measured = measured and sums.front[k] == sums.front[k]
-        front = wp.max(front, sums.front[k])
-        back = wp.max(back, -sums.back[k])
-        all = add_in_order(all, two_numbers(sums.area[k], sums.change[k]), wp.min(end - c, warp_size()))
-        c += warp_size()
-    return all[0], all[1], warp_max(front), -warp_max(back), not warp_any(not measured)
-
-
 @wp.func
 def write_no_contacts(p: wp.int32, pair_contacts: PairContacts):
     pair_contacts.normal[p] = no_vector()
     pair_contacts.point[p] = no_vector()
-    pair_contacts.travel[p] = wp.float64(0.0)
 
 
-@wp.kernel(cuda_max_registers=96)
-def measure_travel_kernel(
+@wp.kernel
+def average_contacts_kernel(
     trees: Trees,
     batch: PairBatch,
     start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
     contacts: Contacts,
     sums: ChunkSums,
-    pair_contacts_inout: PairContacts,
+    pair_contacts_out: PairContacts,
 ):
-    """Estimate the travel of one object pair a warp, and pose its mean point; see `query.stages.contacts`."""
+    """Find the mean point and normal of one object pair a warp."""
     p = wp.tid() / warp_size()
     _, number = sum_lengths(p, start, sums)
     if number == wp.float64(0.0):
         if warp_lane() == 0:
-            write_no_contacts(p, pair_contacts_inout)
+            write_no_contacts(p, pair_contacts_out)
         return
-    origin = contacts.p0[start[p]]
-    n = pair_contacts_inout.normal[p]
-    area, change, front, back, measured = sum_chunks(p, start, sums)
-    if area == wp.float64(0.0) and not measured:
-        own = contact_objects(batch, p)
-        span = wp.vec3i(p, start[p], start[p + 1])
-        front, back = reach_contacts(trees, own, batch.poses[p], span, faces, contacts, n, origin)
+    middle, normals = sum_means(p, start, sums)
     if warp_lane() == 0:
-        pair_contacts_inout.point[p] = origin + sums.middle[p]
-        pair_contacts_inout.travel[p] = choose_travel(trees, batch.pairs[p], n, origin, area, change, front - back)
+        pair_contacts_out.normal[p] = mean_normal(trees, batch.pairs[p], normals)
+        pair_contacts_out.point[p] = contacts.p0[start[p]] + middle
 
 
 @native.func_native(cpu=True)
@@ -314,24 +227,11 @@ def simd_sum_means(
     """Find the mean point of a pair's contacts, from the first end, and the mean of normals, as `sum_means`."""
 
 
-@native.func_native(cpu=True)
-def simd_sum_areas(
-    contacts: Contacts,
-    ends: wp.vec2i,
-    middle: wp.vec3d,
-    normal: wp.vec3d,
-    area: wp.ref[wp.float64],
-    change: wp.ref[wp.float64],
-):
-    """Find the area within a pair's contact curve and its change, as `sum_chunks`."""
-
-
 @wp.kernel
 def sum_pair_kernel(
     trees: Trees,
     batch: PairBatch,
     start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
     contacts: Contacts,
     pair_contacts_out: PairContacts,
 ):
@@ -345,15 +245,5 @@ def sum_pair_kernel(
         return
     middle, normal = wp.vec3d(), wp.vec3d()
     simd_sum_means(contacts, ends, total, number, middle, normal)
-    n = mean_normal(trees, batch.pairs[p], normal)
-    area, change = wp.float64(0.0), wp.float64(0.0)
-    simd_sum_areas(contacts, ends, middle, n, area, change)
-    origin = contacts.p0[ends[0]]
-    front, back = wp.float64(0.0), wp.float64(0.0)
-    if area == wp.float64(0.0):
-        own = contact_objects(batch, p)
-        span = wp.vec3i(p, ends[0], ends[1])
-        front, back = reach_contacts(trees, own, batch.poses[p], span, faces, contacts, n, origin)
-    pair_contacts_out.normal[p] = n
-    pair_contacts_out.point[p] = origin + middle
-    pair_contacts_out.travel[p] = choose_travel(trees, batch.pairs[p], n, origin, area, change, front - back)
+    pair_contacts_out.normal[p] = mean_normal(trees, batch.pairs[p], normal)
+    pair_contacts_out.point[p] = contacts.p0[ends[0]] + middle

@@ -112,19 +112,31 @@ def point_distance(trees: Trees, pose: PairPose, solid: Solid, face: wp.int32, p
 
 @wp.func
 def nearest_face(trees: Trees, pose: PairPose, solid: Solid, point: wp.vec3d, hint: wp.int32, enough: wp.float64):
+    """Return `nearest_face_within` any distance."""
+    return nearest_face_within(trees, pose, solid, point, hint, enough, wp.float64(wp.inf))
+
+
+@wp.func
+def nearest_face_within(
+    trees: Trees, pose: PairPose, solid: Solid, point: wp.vec3d, hint: wp.int32, enough: wp.float64, most: wp.float64
+):
     """Return the least distance of a point from the faces of an object, and the lowest face that has it.
 
     Args:
         point: In A's frame.
         hint: A face that may be near, or NO_NEAREST.
         enough: The search ends with the first face that is nearer.
+        most: Where all faces are farther, it is returned, and NO_NEAREST.
     """
     x = into_frame(pose, solid, point)
-    least, face = wp.float64(wp.inf), wp.int32(hint)
+    least, face = wp.float64(most), wp.int32(NO_NEAREST)
     if hint != NO_NEAREST:
-        least = point_distance(trees, pose, solid, hint, point)
-        if least < enough:
-            return least, face
+        d = point_distance(trees, pose, solid, hint, point)
+        if d <= most:
+            least = d
+            face = hint
+            if least < enough:
+                return least, face
     limit = (least + solid.margin) * solid.grow
     limit = limit * limit
     stack = wp.zeros(shape=(STACK_ROOM,), dtype=wp.int32)

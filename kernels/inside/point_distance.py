@@ -1,4 +1,4 @@
-"""Signed distances of points from the surface of one object, in its model's frame: a thread a run of points.
+"""Signed distances of points from objects, the least of each, in the frame of each object: a thread a run of points.
 
 Points are sorted along a Morton curve, so that the nearest face of one is a good bound for the next. A point that lies
 nearer to the one before than the surface does lies on the same side; of others the even-odd ray test tells.
@@ -7,10 +7,17 @@ nearer to the one before than the surface does lies on the same side; of others 
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import Trees
+from warp_abtree.kernels.base.arrays import Trees, no_vector
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import PairPose
-from warp_abtree.kernels.inside.nearest_face import NO_NEAREST, Solid, nearest_face, point_features, point_weights
+from warp_abtree.kernels.inside.nearest_face import (
+    NO_NEAREST,
+    Solid,
+    nearest_face_within,
+    point_features,
+    point_weights,
+    square_outside,
+)
 from warp_abtree.kernels.inside.parity import is_inside, load_posed_face
 from warp_abtree.kernels.intersect.box_tiles import spread_bits
 from warp_abtree.kernels.triangle.distance import largest_coordinate
@@ -57,49 +64,114 @@ def solid_about(trees: Trees, pose: PairPose, centre: wp.vec3d, point: wp.vec3d)
     return solid
 
 
-@wp.kernel(module_options=MODULE_OPTIONS, module="unique")
-def measure_point_kernel(
-    run: wp.int32,
-    has_inside: bool,
-    trees: Trees,
-    points: wp.array(dtype=wp.vec3d),
-    order: wp.array(dtype=wp.int32),
-    distance_out: wp.array(dtype=wp.float64),
-    face_out: wp.array(dtype=wp.int32),
-    nearest_out: wp.array(dtype=wp.vec3d),
-):
-    """Write the distances of points from object 0, negative inside, their nearest faces and the points on these.
+@wp.struct
+class PointDistances:
+    """What points are given; all arrays of shape [point]."""
 
-    Args:
-        run: Points of a thread.
-        has_inside: Whether the object is a closed surface.
-        points: In the model's frame.
-        order: Indices of points, neighbours beside each other.
-    """
-    state = trees.objects.state[0]
+    distance: wp.array(dtype=wp.float64)  # [world units], negative inside
+    object: wp.array(dtype=wp.int32)  # -1 for none
+    face: wp.array(dtype=wp.int32)  # -1 where it is farther than asked
+    nearest: wp.array(dtype=wp.vec3d)  # on that face, or NaN
+
+
+@wp.struct
+class LastPoint:
+    """The point before, as the object of its answer sees it."""
+
+    place: wp.int32  # of the object among those asked, -1 for none
+    face: wp.int32  # NO_NEAREST for none
+    point: wp.vec3d  # in the object's frame
+    free: wp.float64  # no surface is as near [model units]
+    inside: bool  # the object
+
+
+@wp.func
+def place_on_face(trees: Trees, pose: PairPose, o: wp.int32, face: wp.int32, point: wp.vec3d):
+    """Return the point of an object's face that is nearest to a point of its frame, world frame; NaN without a face."""
+    if face == NO_NEAREST:
+        return no_vector()
+    a, b, c = load_posed_face(trees, pose, False, face)
+    features, _size = point_features(a, b, c, point)
+    w = point_weights(features)
+    return trees.objects.rotation[o] * ((w[0] * a + w[1] * b) + w[2] * c) + trees.objects.position[o]
+
+
+@wp.func
+def pose_alone(trees: Trees, o: wp.int32):
+    """Return where the arrays of an object's state lie, as those of A of a pair."""
+    state = trees.objects.state[o]
     pose = PairPose()
     pose.node_a = trees.states.node_start[state]
     pose.corner_a = trees.states.face_start[state]
-    centre = trees.models.centre[trees.states.model[state]]
-    hint = wp.int32(NO_NEAREST)
-    last = wp.vec3d()
-    free = -wp.float64(1.0)
-    inside = bool(False)
+    return pose
+
+
+@wp.kernel(module_options=MODULE_OPTIONS, module="unique")
+def measure_point_kernel(
+    run: wp.int32,
+    within: wp.float64,
+    trees: Trees,
+    asked: wp.array(dtype=wp.vec2i),
+    points: wp.array(dtype=wp.vec3d),
+    order: wp.array(dtype=wp.int32),
+    found_out: PointDistances,
+):
+    """Write the least distances of points from some objects, negative inside, and where they are nearest.
+
+    Args:
+        run: Points of a thread.
+        within: Surfaces farther away are not looked for: distances are infinite.
+        asked: Objects, rising, and whether they have an inside.
+        order: Indices of points, neighbours beside each other.
+    """
+    last = LastPoint()
+    last.place = -1
     for k in range(run):
         i = run * wp.tid() + k
         if i < points.shape[0]:
             q = order[i]
-            point = points[q]
-            solid = solid_about(trees, pose, centre, point)
-            distance, face = nearest_face(trees, pose, solid, point, hint, -wp.float64(1.0))
-            hint = face
-            if has_inside and not wp.length(point - last) < free:
-                inside = is_inside(trees, pose, False, centre, point)
-            last = point
-            free = distance - solid.slack
-            a, b, c = load_posed_face(trees, pose, False, face)
-            near, _size = point_features(a, b, c, point)
-            w = point_weights(near)
-            distance_out[q] = wp.where(inside, -distance, distance)
-            face_out[q] = face
-            nearest_out[q] = (w[0] * a + w[1] * b) + w[2] * c
+            first = last.place
+            least, object, nearest = wp.float64(within), wp.int32(NO_NEAREST), wp.int32(NO_NEAREST)
+            near = no_vector()
+            # The object of the point before comes first.
+            for j in range(-1, asked.shape[0]):
+                place = wp.where(j < 0, first, j)
+                if place >= 0 and (j < 0 or place != first):
+                    o = asked[place][0]
+                    pose = pose_alone(trees, o)
+                    centre = trees.models.centre[trees.states.model[trees.objects.state[o]]]
+                    point = wp.transpose(trees.objects.rotation[o]) * (points[q] - trees.objects.position[o])
+                    solid = solid_about(trees, pose, centre, point)
+                    reach = (wp.max(least, wp.float64(0.0)) + solid.margin) * solid.grow
+                    root = load_node(trees.states, pose.node_a + 1)
+                    meets = square_outside(root, point - centre) <= reach * reach
+                    inside = bool(False)
+                    if meets and asked[place][1] != 0:
+                        inside = last.inside
+                        if place != last.place or not wp.length(point - last.point) < last.free:
+                            inside = is_inside(trees, pose, False, centre, point)
+                    if meets and (inside or least >= wp.float64(0.0)):
+                        hint = wp.where(place == last.place, last.face, NO_NEAREST)
+                        most = wp.where(inside, within, least)
+                        enough = -wp.float64(1.0)
+                        distance, face = nearest_face_within(trees, pose, solid, point, hint, enough, most)
+                        signed = wp.where(inside, -distance, distance)
+                        if inside and face == NO_NEAREST:
+                            signed = -wp.float64(wp.inf)
+                        better = signed < least or (signed == least and o < object)
+                        better = better and (inside or face != NO_NEAREST)
+                        if better:
+                            least = signed
+                            object = o
+                            nearest = face
+                            near = place_on_face(trees, pose, o, face, point)
+                        if better or last.place < 0 or place == last.place:
+                            last.place = place
+                            last.face = face
+                            last.point = point
+                            last.free = distance - solid.slack
+                            last.inside = inside
+            found_out.distance[q] = wp.where(object == NO_NEAREST, wp.float64(wp.inf), least)
+            found_out.object[q] = wp.where(object == NO_NEAREST, -1, object)
+            found_out.face[q] = wp.where(nearest == NO_NEAREST, -1, nearest)
+            found_out.nearest[q] = near

@@ -4,7 +4,7 @@ A record has no padding, so that its numbers lie at any byte; one thread writes 
 
     [ pair 4 | faces 2 x 4 | p0, p1, normal_a, normal_b, normal 5 x 3 x 4 or 8 | coplanar 1 ] bytes of a contact; with
     a gap its separation, 4 or 8 bytes, stands before the flag
-    [ count 8 | point, normal 2 x 3 x 4 or 8 | travel 4 or 8 ] bytes of a summary
+    [ count 8 | point, normal 2 x 3 x 4 or 8 ] bytes of a summary
 """
 
 import functools
@@ -18,8 +18,8 @@ from warp_abtree.kernels.contacts.summary import PairContacts
 MODULE_OPTIONS = native.options()
 wp.set_module_options(MODULE_OPTIONS)
 
-# Numbers of a record: three indices, five vectors, a flag, one more with a gap; a count, two vectors, a travel.
-CONTACT_NUMBERS, PAIR_NUMBERS = 19, 8
+# Numbers of a record: three indices, five vectors, a flag, one more with a gap; a count, two vectors.
+CONTACT_NUMBERS, PAIR_NUMBERS = 19, 7
 
 
 @native.func_native()
@@ -118,14 +118,12 @@ def pair_packer(real: type):
         """Write one number a thread, of the object pairs from the first one on; threads are [pair, number]."""
         i, k = wp.tid()
         p = first + i
-        at = i * wp.static(8 + 7 * size)
+        at = i * wp.static(8 + 6 * size)
         if k == 0:
             store_bits(records_out, at, 8, count[p])
             return
-        x = means.travel[p]
-        if k < 4:
-            x = means.point[p][k - 1]
-        elif k < 7:
+        x = means.point[p][(k - 1) % 3]
+        if k > 3:
             x = means.normal[p][k - 4]
         bits = wp.static(float64_bits if size == 8 else float32_bits)(x)
         store_bits(records_out, at + 8 + wp.static(size) * (k - 1), wp.static(size), bits)
@@ -183,19 +181,17 @@ def number_copier(real: type):
 def summary_copier(real: type):
     """Return the kernel that copies summaries into arrays of their own, real numbers float32 or float64."""
     vector = wp.vec3d if real is wp.float64 else wp.vec3
-    convert, narrow = (keep_vector, keep_number) if real is wp.float64 else (round_vector, round_to_float32)
+    convert = keep_vector if real is wp.float64 else round_vector
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def copy_summary_kernel(
         means: PairContacts,
         point_out: wp.array(dtype=vector),
         normal_out: wp.array(dtype=vector),
-        travel_out: wp.array(dtype=real),
     ):
         """Copy the summary of one object pair a thread."""
         p = wp.tid()
         point_out[p] = wp.static(convert)(means.point[p])
         normal_out[p] = wp.static(convert)(means.normal[p])
-        travel_out[p] = wp.static(narrow)(means.travel[p])
 
     return copy_summary_kernel

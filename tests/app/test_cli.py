@@ -5,6 +5,7 @@ import importlib.util
 import io
 import json
 import re
+import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -119,10 +120,10 @@ def test_query_against_the_library(files, capsys):
     assert shown.endswith("distance                farther than 2.5\n") and "points" not in shown
     apart = answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--output", "contacts")
     nowhere = [None, None, None]
-    assert apart["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere, "travel": 0}
+    assert apart["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere}
     assert apart["count"] == 0 and apart["faces"] == apart["contacts"] == []
     shown, _ = run(capsys, "query", *asked[:10], "--output", "contacts", "--device", "cpu")
-    assert "pair contacts           count 0, point none, normal none, travel 0\n" in shown and "nan" not in shown
+    assert "pair contacts           count 0, point none, normal none\n" in shown and "nan" not in shown
     shown, _ = run(capsys, "query", "ball.obj", "ring.ply", "--output", "contacts", "--device", "cpu")
     assert "intersects              yes\n" in shown and len(re.findall(r"^\d+ +\d+$", shown, re.M)) == report.LISTED
     assert re.search(r"^and \d+ more; --json lists all$", shown, re.M) and "face_a  face_b  p0" in shown
@@ -156,7 +157,7 @@ def test_contacts_against_the_library(files, capsys, device, precision, b, pose)
     assert expected.contacts["coplanar"].any() == (b == "box.obj")
     run(capsys, "query", *words, "--device", device, "--record", "arrays.npz")
     with np.load("arrays.npz") as arrays:
-        assert set(arrays) == {"any", "count", "faces", "contacts", "pair_contacts"}
+        assert set(arrays) == {"pairs", "any", "count", "faces", "contacts", "pair_contacts"}
         for name in arrays:
             assert arrays[name].dtype == getattr(expected, name).dtype
             assert arrays[name].tobytes() == getattr(expected, name).tobytes()
@@ -171,10 +172,75 @@ def test_record_of_each_output(files, capsys):
         shown, _ = run(capsys, *words.split(), "out.npz", "--output", output)
         assert shown.endswith("written                 out.npz\n")
         with np.load("out.npz") as arrays:
-            assert set(arrays) == names and arrays["any"][0]
+            assert set(arrays) == {"pairs", *names} and arrays["any"][0]
     run(capsys, *words.split(), "out.csv", "--output", "faces")
     rows = list(csv.reader(io.StringIO(Path("out.csv").read_text())))
     assert rows[0] == ["face_a", "face_b"] and [[int(x) for x in row] for row in rows[1:]] == found["faces"]
+
+
+TWO_BALLS = """[models.ball]
+shape = "icosphere"
+[[objects]]
+model = "ball"
+name = "left"
+[[objects]]
+model = "ball"
+name = "right"
+position = [1.5, 0.1, 0]
+[[objects]]
+model = "ball"
+position = [9, 0, 0]
+"""
+
+
+def test_query_of_a_scene_file(files, capsys, device):
+    """All pairs near one another, against the library; the same of an assembly."""
+    Path("balls.toml").write_text(TWO_BALLS)
+    scene = ab_app.load_scene("balls.toml", device=device).scene
+    ab.to_trimesh(scene).export("balls.glb")
+    found = answer(capsys, "balls.toml", "--record", "out.npz", device=device)
+    (row,) = found["pairs"]
+    expected = scene.intersect([(0, 1)], output="count")
+    assert row == {"first": "left", "second": "right", "any": True, "count": expected.count[0]}
+    assert (found["objects"], found["near"], found["intersecting"]) == (3, 1, 1)
+    with np.load("out.npz") as arrays:
+        assert arrays["pairs"].tolist() == [[0, 1]] and arrays["count"] == expected.count
+    asked = ("--output", "distance", "--beyond", 10, "--solid", "--signed", "--record", "out.csv")
+    found = answer(capsys, "balls.glb", *asked, device=device)
+    assert [row["first"] for row in found["pairs"][:2]] == ["left", "left"] and found["near"] == 3
+    assert found["pairs"][0]["distance"] < -0.3 and 6 < found["pairs"][1]["distance"] < 10
+    rows = list(csv.DictReader(Path("out.csv").open()))
+    assert [float(row["distance"]) for row in rows] == [row["distance"] for row in found["pairs"]]
+    shown, _ = run(capsys, "query", "balls.toml", "--device", device)
+    assert re.search(r"^first +second +any +count\nleft +right +yes +\d+$", shown, re.M)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("query ball.obj", "ball.obj: B is missing; alone stands a scene file"),
+        ("query gone.glb", "gone.glb: "),
+        ("query balls.toml --pose 0 0 0 0 0 0 1", "--pose: for two meshes; balls.toml says"),
+        ("query balls.toml --lod-b 0.1", "--lod-b: for two meshes; balls.toml says"),
+        ("query balls.toml --output distance --signed", "signed: no object"),
+    ],
+)
+def test_query_of_a_scene_refuses(files, capsys, words, message):
+    Path("balls.toml").write_text(TWO_BALLS)
+    shown, errors = run(capsys, *words.split(), status=2)
+    assert not shown and len(errors) == 1 and message in errors[0]
+
+
+def test_shells_complete_scenes(tmp_path, capsys):
+    """By the function of the script that is printed, names and files alike."""
+    pytest.importorskip("shtab")
+    with pytest.raises(SystemExit):
+        cli.main(["--print-completion", "bash"])
+    script = tmp_path / "script"
+    script.write_text(capsys.readouterr().out + "\n_warp_abtree_scenes r\n")
+    (tmp_path / "rod.glb").touch()
+    found = subprocess.run(["bash", "script"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["rain", "rod.glb"]
 
 
 # Numbers as they are given, and as they are shown.

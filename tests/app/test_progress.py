@@ -29,6 +29,19 @@ def test_progress_on_a_terminal_is_a_bar(monkeypatch):
     assert stream.getvalue().endswith("\x1b[2K"), "the bar is cleared"
 
 
+def test_kernels_are_counted_on_a_terminal(monkeypatch):
+    pytest.importorskip("rich")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    stream, clock = Terminal(), iter([0.0, 1.0, 2.0, 3.0, 4.0])
+    progress = progress_module.Progress(stream, clock=lambda: next(clock))
+    for done in range(5):
+        progress.compiling(done, 4)
+    shown = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", stream.getvalue())
+    assert re.findall(r"compiling kernels .* (\d of 4)", shown.replace("\r", "\n"))[-1] == "4 of 4"
+    assert progress.stage is None and stream.getvalue().endswith("\x1b[2K"), "the bar is cleared"
+
+
 @pytest.mark.parametrize("terminal", [False, True])
 def test_progress_without_a_bar_is_a_line_a_stage(monkeypatch, terminal):
     monkeypatch.setitem(sys.modules, "rich", None)

@@ -136,7 +136,7 @@ def test_batches_in_the_world(device, names):
     check_fields(swapped)
     check_mirrored(result.contacts, swapped.contacts)
     some = result.count > 0
-    for name, sign in (("point", 1), ("normal", -1), ("travel", 1)):
+    for name, sign in (("point", 1), ("normal", -1)):
         before = result.pair_contacts[name][some]
         np.testing.assert_allclose(swapped.pair_contacts[name][some], sign * before, rtol=1e-6, atol=1e-9)
 
@@ -164,7 +164,7 @@ def test_powers_of_two_scale_every_bit(device, gap):
         plain = result if plain is None else plain
         for rows, wanted in ((result.contacts, plain.contacts), (result.pair_contacts, plain.pair_contacts)):
             for name in rows.dtype.names:
-                scaled = name in ("p0", "p1", "separation", "point", "travel")
+                scaled = name in ("p0", "p1", "separation", "point")
                 np.testing.assert_array_equal(rows[name], np.ldexp(wanted[name], k) if scaled else wanted[name])
 
 
@@ -211,28 +211,11 @@ def test_boxes(device):
         assert np.isclose(np.linalg.norm(rows["p1"] - rows["p0"], axis=1).sum(), 4.0)
         np.testing.assert_allclose(summed["point"], (0.25, 0.5, 0.5), atol=1e-15)
         np.testing.assert_allclose(summed["normal"], (0, 0, sign), atol=1e-15)
-        assert abs(summed["travel"] - 0.1) < 1e-6
-
-
-def test_travel_without_an_area(device):
-    """A tip that touches: the overlap along the normal of the faces that touch, or of the boxes if that is less."""
-    tip = np.array([[0.25, 0.5, 0.5], [1, 0, 2], [1, 2, 1], [-2, 0, 2]])
-    models = [box(4, 4, 1), ab.Model.from_arrays(tip, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])]
-    result = contacts_of(device, *((model, STILL) for model in models), pairs=[(0, 1), (1, 0)])
-    rows = result.contacts[result.contacts["pair"] == 0]
-    normal = result.pair_contacts["normal"][0]
-    assert len(rows) > 2 and (rows["p0"] == tip[0]).all() and (rows["p1"] == tip[0]).all()
-    ends = [(-2, 2), (-2, 2), (-0.5, 0.5)], np.stack([tip.min(0), tip.max(0)], 1)
-    faces = [triangles(model, rows["faces"][:, k]) @ normal for k, model in enumerate(models)]
-    boxes = [np.array(np.meshgrid(*bounds)).reshape(3, -1).T @ normal for bounds in ends]
-    wanted = min(part[0].max() - part[1].min() for part in (faces, boxes))
-    assert wanted > 0
-    np.testing.assert_allclose(result.pair_contacts["travel"], [wanted] * 2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("overlap", [0.05, 1.0])
 def test_balls(device, overlap):
-    """Two unit balls: a circle, the normal from one to the other, and a travel as far off as is said."""
+    """Two unit balls: a circle, and the normal from one to the other."""
     ball, d, axis = trimesh.creation.icosphere(subdivisions=4), 2 - overlap, np.array([0.48, 0.6, 0.64])
     model, turned = ab.Model.from_arrays(ball.vertices, ball.faces), (0.3, 0, 0, np.sqrt(0.91))
     result = contacts_of(device, (model, (1, 2, 3, 0, 0, 0, 1)), (model, (*((1, 2, 3) + d * axis), *turned)))
@@ -241,7 +224,6 @@ def test_balls(device, overlap):
     summed = result.pair_contacts[0]
     np.testing.assert_allclose(summed["point"], (1, 2, 3) + d / 2 * axis, atol=0.01)
     assert summed["normal"] @ axis > 0.9999
-    assert 0.9 < summed["travel"] / (overlap * (2 + d) / (2 * d)) < 1.1
 
 
 def test_rounded_signs_give_whole_contacts(device):

@@ -59,7 +59,8 @@ def touching(device, pairs=12):
 def test_any_order_of_hits(device):
     scene, pairs = touching(device)
     expected = ab.ContactQuery(scene, pairs).run()
-    assert check_summaries(expected) > 5 and (expected.count > 2 * CHUNK).sum() > 3
+    check_summaries(expected)
+    assert (expected.count > 2 * CHUNK).sum() > 3
     rng, k = np.random.default_rng(1), len(expected.faces)
     for bits in (63, 20):  # too few for a pair and two faces: sorted twice
         with testing.regime(key_bits=bits):
@@ -122,17 +123,16 @@ def test_any_batch(device):
 def check_device_arrays(query, result):
     """What lies on the device is what the host was given; starts cover the rows of each pair."""
     start, k = query.start.numpy(), len(result.faces)
-    assert len(start) == len(query.pairs) + 1 == len(query.pair_contacts.travel) + 1
+    assert len(start) == len(query.pairs) + 1 == len(query.pair_contacts.point) + 1
     rows = result.faces[:, 0]
     np.testing.assert_array_equal(start, np.searchsorted(rows, np.arange(len(start))))
     np.testing.assert_array_equal(query.faces.numpy()[:k], result.faces)
     for name in result.contacts.dtype.names[2:]:
         np.testing.assert_array_equal(getattr(query.contacts, name).numpy()[:k], result.contacts[name])
-    for name in ("point", "normal", "travel"):
+    for name in ("point", "normal"):
         found = getattr(query.pair_contacts, name).numpy()
         np.testing.assert_array_equal(found[: len(result.pairs)], result.pair_contacts[name])
-        beyond = found[len(result.pairs) :]
-        assert (beyond == 0).all() if name == "travel" else np.isnan(beyond).all()
+        assert np.isnan(found[len(result.pairs) :]).all()
 
 
 def test_pairs_of_the_broad_phase(device):

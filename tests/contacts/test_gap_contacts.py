@@ -148,14 +148,11 @@ def test_without_more_faces_nothing_changes(device, regime):
             np.testing.assert_array_equal(crossing[name], plain.contacts[name])
         assert (len(result.contacts) > len(crossing)) == (gap > 0)
         np.testing.assert_array_equal(result.any, plain.any)
-        for name in ("point", "normal", "travel"):
-            found, wanted = result.pair_contacts[name], plain.pair_contacts[name]
-            close = np.isclose(found, wanted, rtol=1e-9, atol=1e-9, equal_nan=True)
-            # Where the area of a curve is lost in rounding, as of faces that are there twice, so is its sign.
-            assert np.array_equal(found, wanted, equal_nan=True) if gap == 0 else close.mean() > 0.9
-            assert close.all() or name == "travel"
+        for name in ("point", "normal"):
+            room = 1e-9 * (gap > 0)
+            np.testing.assert_allclose(result.pair_contacts[name], plain.pair_contacts[name], rtol=room, atol=room)
     for p in np.flatnonzero(plain.any)[:5]:
-        point, _, _ = summary(plain.contacts[plain.contacts["pair"] == p])
+        point, _ = summary(plain.contacts[plain.contacts["pair"] == p])
         np.testing.assert_allclose(result.pair_contacts["point"][p], point, atol=1e-9)
 
 

@@ -16,7 +16,6 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.poses import COORDINATE_MIN
 from warp_abtree.kernels.contacts.contact import SHORTEST_NORMAL
 from warp_abtree.kernels.contacts.separation import CLOSEST, LEAST_SEPARATION
-from warp_abtree.kernels.contacts.travel import LEAST_SINE_SQUARED
 from warp_abtree.kernels.exact.double_word import BOUND_DOUBLE
 from warp_abtree.kernels.exact.expansion import two_sum
 from warp_abtree.kernels.exact.predicates import BOUND_2D, BOUND_3D, EXACT, FLOAT32, UNCERTAIN
@@ -31,7 +30,6 @@ DOUBLES = {
     "BOUND_3D": BOUND_3D,
     "BOUND_DOUBLE": BOUND_DOUBLE,
     "COORDINATE_MIN": COORDINATE_MIN,
-    "LEAST_SINE_SQUARED": LEAST_SINE_SQUARED,
     "RELATIVE_ERROR": RELATIVE_ERROR,
     "SHORTEST_NORMAL": SHORTEST_NORMAL,
     "LEAST_SEPARATION": LEAST_SEPARATION,

@@ -49,7 +49,7 @@ def summed(terms):
 
 
 def summary(rows):
-    """Return (point, normal, depth) of a pair's contacts; None for what the mean normal and the curve do not tell."""
+    """Return (point, normal) of a pair's contacts; None for a normal that the mean does not tell."""
     origin, count = rows["p0"][0], len(rows)
     lengths = [length(q - p) for p, q in zip(rows["p0"], rows["p1"])]
     total = summed(lengths)
@@ -58,40 +58,25 @@ def summary(rows):
     middle = summed([w * (0.5 * (p - origin) + 0.5 * (q - origin)) for w, p, q in ends])
     mean = summed([w * n for w, n in zip(weights, rows["normal"])])
     if length(mean) <= 2.0**-20:
-        return origin + middle, None, None
+        return origin + middle, None
     _, n = scaled(mean)
-    n = n / np.sqrt(dot(n, n))
-    areas, changes = [np.float64(0)], [np.float64(0)]
-    for row in rows:
-        r, s = row["p0"] - origin - middle, row["p1"] - row["p0"]
-        cosine = dot(row["normal_a"], row["normal_b"])
-        square = 1.0 - cosine * cosine
-        away = row["normal_b"] - row["normal_a"] * cosine
-        flat = square < 2.0**-40
-        areas.append(0.0 if row["coplanar"] else 0.5 * dot(n, cross(r, s)))
-        changes.append(0.0 if row["coplanar"] or flat else dot(n, row["normal_b"]) / square * dot(away, cross(s, n)))
-    area, change = summed(areas[1:]), summed(changes[1:])
-    return origin + middle, n, -area / change if area * change < 0 else None
+    return origin + middle, n / np.sqrt(dot(n, n))
 
 
 def check_summaries(result):
-    """Compare every pair's summary to the bit; return how often the contact curve told the depth."""
-    curves = 0
+    """Compare every pair's summary to the bit."""
     assert len(result.pair_contacts) == len(result.pairs) and result.pair_contacts["count"].dtype == np.int64
     np.testing.assert_array_equal(result.pair_contacts["count"], result.count)
     for p, got in enumerate(result.pair_contacts):
         rows = result.contacts[result.contacts["pair"] == p]
         assert len(rows) == result.count[p]
         if not len(rows):
-            assert np.isnan(got["point"]).all() and np.isnan(got["normal"]).all() and got["travel"] == 0
+            assert np.isnan(got["point"]).all() and np.isnan(got["normal"]).all()
             continue
-        point, normal, depth = summary(rows)
+        point, normal = summary(rows)
         assert got["point"].tobytes() == point.tobytes()
         assert normal is None or got["normal"].tobytes() == normal.tobytes()
         assert abs(np.linalg.norm(got["normal"]) - 1) < 1e-15
-        assert 0 <= got["travel"] and (depth is None or got["travel"] <= depth)
-        curves += got["travel"] == depth
-    return curves
 
 
 def check_mirrored(rows, swapped):

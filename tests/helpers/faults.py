@@ -73,7 +73,7 @@ def check_buffer_lengths(queries):
         pairs += [] if query.broad_phase is None else [query.broad_phase.pairs]
         if isinstance(query, ab.ContactQuery):
             means, contacts = query.pair_contacts, query.contacts
-            pairs += [means.point, means.normal, means.travel, query.start[1:]]
+            pairs += [means.point, means.normal, query.start[1:]]
             hits += [query.faces, *(getattr(contacts, name) for name in (*VECTORS, "coplanar"))]
         assert {len(array) for array in pairs} == {rooms.pairs} and {len(array) for array in hits} == {rooms.hits}
         for asked in (asked for stage in query.stages for asked in stage.arrays(rooms)):

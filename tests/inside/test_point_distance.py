@@ -9,6 +9,7 @@ from helpers.samples import sample
 from helpers.solids import model_of, shell, turned, voxel_mesh
 from oracles.distance import brute_distances, exact_distance_sq
 from oracles.inside import parity
+from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree.model.mesh import MeshError
@@ -93,6 +94,101 @@ def test_points_do_not_see_one_another(device, monkeypatch):
         assert ab.signed_distance(model, points[k : k + 1], device=device)[0] == whole[0][k]
     assert ab.signed_distance(model, np.empty((0, 3)), device=device).shape == (0,)
     assert ab.contains(model, np.float32([[0, 0, 0]]), device=device).dtype == bool
+
+
+def check_within(whole, part, within):
+    """A bounded answer (distance, ..., nearest, face) is the whole one up to the bound, and says nothing beyond."""
+    near = np.abs(whole[0]) <= within
+    assert near.any() and not near.all()
+    for before, now in zip(whole, part):
+        assert before[near].tobytes() == now[near].tobytes()
+    np.testing.assert_array_equal(part[0][~near], np.where(whole[0][~near] < 0, -np.inf, np.inf))
+    assert np.isnan(part[-2][~near]).all() and (part[-1][~near] == -1).all()
+
+
+@pytest.mark.parametrize("within", [0.0, 0.03, 0.2])
+def test_distances_end_at_a_bound(device, within):
+    rng, model = np.random.default_rng(4), sample("torus")
+    corners = model.mesh_at(model.lod_max)[0][model.mesh_at(model.lod_max)[1]]
+    points = np.concatenate([rng.uniform(-1.2, 1.2, (400, 3)), corners[:9, 0]])
+    for signed in (True, False):
+        whole, part = (
+            ab.signed_distance(model, points, device=device, signed=signed, nearest=True, within=bound)
+            for bound in (None, within)
+        )
+        check_within(whole, part, within)
+
+
+def placed_objects(rng, device):
+    """Return a scene of solids that overlap and are nested, surfaces, another world and a free place."""
+    scene, turns = ab.Scene(device), rng.normal(size=(9, 4))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    names = ("torus", "small ball", "soup", "torus", "small ball", "torus", "small ball", "twins", "torus")
+    for k, (name, turn) in enumerate(zip(names, turns)):
+        model = sample(name)
+        place = np.zeros(3) if k in (1, 3) else rng.uniform(-1, 1, 3)
+        lod = model.lod_max // (4 if k % 2 else 8)
+        scene.add(model, (*place, *turn), (0, 0, 0, -1, 0, 7, 0, 0, 0)[k], lod, solid=name in ("torus", "small ball"))
+    scene.remove(4)
+    return scene
+
+
+def test_scene_has_the_least_distance_of_its_objects(device):
+    """Against brute force on posed corners, and parity; whichever objects, points and bound there are."""
+    rng = np.random.default_rng(11)
+    scene = placed_objects(rng, device)
+    points = np.concatenate([rng.uniform(-2, 2, (60, 3)), rng.normal(scale=0.3, size=(60, 3))])
+    truth = np.full((len(points), scene.object_count), np.inf)
+    for i in (0, 1, 2, 3, 6, 7, 8):
+        model, pose = scene.models[scene.object_model[i]], scene.poses[i]
+        vertices, faces, _ = model.mesh_at(int(scene.lods[i]))
+        turn = quaternion_matrix(pose[3:])
+        truth[:, i] = brute_distances(points, (vertices @ turn.T + pose[:3])[faces])
+        if scene.object_solid[i]:
+            inside = [parity(point, vertices[faces]) for point in (points - pose[:3]) @ turn]
+            truth[:, i] *= np.where(inside, -1, 1)
+    found = scene.signed_distance(points, nearest=True)
+    least = truth.min(1)
+    assert (least < 0).sum() > 10 and len(np.unique(found[1])) > 5
+    np.testing.assert_allclose(found[0], least, atol=1e-13)
+    np.testing.assert_allclose(truth[np.arange(len(points)), found[1]], least, atol=1e-13)
+    np.testing.assert_allclose(np.linalg.norm(points - found[2], axis=1), np.abs(least), atol=1e-13)
+    surfaces = scene.signed_distance(points, signed=False)
+    np.testing.assert_allclose(surfaces[0], np.abs(truth).min(1), atol=1e-13)
+    order = rng.permutation(len(points))
+    for part, other in zip(found, scene.signed_distance(points[order], nearest=True)):
+        assert part[order].tobytes() == other.tobytes()
+    bounded = scene.signed_distance(points, within=0.3, nearest=True)
+    np.testing.assert_array_equal(bounded[1], np.where(bounded[0] == np.inf, -1, bounded[1]))
+    shallow = least >= -0.3  # where solids overlap deeper, any of them may be named
+    check_within(
+        [part[shallow] for part in (found[0], *found[2:])], [part[shallow] for part in (bounded[0], *bounded[2:])], 0.3
+    )
+    assert (bounded[0][~shallow] == -np.inf).all() and (bounded[3][~shallow] == -1).all() and (~shallow).any()
+    other = scene.signed_distance(points, world=7)[1]
+    assert set(other) == {3, 5}
+
+
+@pytest.mark.parametrize("names", [("small ball", "torus"), ("torus", "small ball")])
+def test_points_of_one_object_say_nothing_of_another(device, names):
+    """The middle of a ball is inside it, and outside of the torus around it."""
+    scene = ab.Scene(device)
+    for name in names:
+        scene.add(sample(name), solid=True)
+    distance, object = scene.signed_distance([(0, 0, 0), (0.01, 0, 0)])
+    assert object.tolist() == [names.index("small ball")] * 2 and (distance < 0).all()
+
+
+def test_scene_of_points_refuses(device):
+    scene = ab.Scene(device)
+    refused(ValueError, "no object in world 0", scene.signed_distance, np.zeros((1, 3)))
+    scene.add(sample("small ball"), world=3)
+    refused(ValueError, "no object in world 0", scene.signed_distance, np.zeros((1, 3)))
+    refused(ValueError, "no object is a solid", scene.signed_distance, np.zeros((1, 3)), world=3)
+    refused(ValueError, "within: -1", scene.signed_distance, np.zeros((1, 3)), 3, False, -1)
+    refused(ValueError, "point 0 is not finite", scene.signed_distance, [[np.inf, 0, 0]], 3, False)
+    distance, object = scene.signed_distance(np.zeros((0, 3)), 3, False)
+    assert distance.shape == object.shape == (0,)
 
 
 def test_bad_points_and_models_are_refused(device):

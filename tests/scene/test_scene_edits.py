@@ -1,11 +1,16 @@
 """Editing a scene: names, poses of one object, objects removed and changed; what is left is a scene made anew."""
 
+import copy
 import csv
+import gc
+import pickle
 import sys
+import weakref
 
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 from conftest import slow
 from helpers import refused
 from helpers.samples import STILL, random_poses, sample
@@ -15,6 +20,7 @@ from hypothesis import strategies as st
 
 import warp_abtree as ab
 from warp_abtree.model.mesh import MeshError
+from warp_abtree.query.operator import Operator
 
 MODELS = ("small ball", "box", "torus", "twins")
 FLAGS = {"static": st.booleans(), "collision_group": st.integers(0, 3), "collision_mask": st.integers(0, 3)}
@@ -101,6 +107,7 @@ def test_what_is_removed_is_nowhere(device):
     scene.remove(1)
     refused(RuntimeError, "removed", query.launch)
     assert scene.object_count == 3 and scene.present.tolist() == [True, False, True]
+    scene.set_poses(scene.poses)
     before = everything(scene)
     for call, *arguments in (
         (scene.intersect, [(0, 2), (2, 1)]),
@@ -118,8 +125,20 @@ def test_what_is_removed_is_nowhere(device):
     query = ab.Query(scene, "any", pairs=[(0, 2)])
     scene.remove([])
     query.launch()
-    # Of a place without an object any LOD is one, in scenes and frames.
+    # Of a place without an object any LOD is one, in scenes and frames, and any pose.
     scene.set_lods([30, 10**6, 12])
+    start, poses = scene.poses, scene.poses
+    poses[1] = np.nan
+    scene.set_poses(poses)
+    scene.set_poses(wp.array(poses, dtype=wp.float64, device=device))
+    ends = scene.poses + [9, 0, 0, 0, 0, 0, 0]
+    times = scene.first_contact([(0, 2)], ends).time
+    ends[1] = np.nan
+    np.testing.assert_array_equal(scene.first_contact([(0, 2)], ends).time, times)
+    ab.Frame(scene, type("Still", (list,), {"poses": lambda self, time, out: np.array(self)})(poses)).step()
+    refused(ValueError, "pose 2 is not finite", scene.set_poses, poses[[0, 0, 1]])
+    scene.set_poses(np.stack([np.eye(4), np.zeros((4, 4)), np.eye(4)]))
+    scene.set_poses(start)
     ab.Frame(scene, lods=lambda _: np.array([30, -1, 12])).step()
     assert everything(scene) == before
     assert list(ab.to_trimesh(scene).graph.nodes_geometry) == ["small ball 0", "small ball 2"]
@@ -230,6 +249,41 @@ def test_changes_are_those_of_add_and_leave_the_rest(device):
     query.launch()
     scene.change(0, static=True)
     refused(RuntimeError, "changed", query.launch)
+
+
+def test_an_edit_gives_all_memory_back_at_once(device):
+    """No operator, tree state or broad phase waits for the garbage collector, nor do operators of one's own."""
+    scene = pair_scene(device)
+    for output in ("any", "faces", "contacts", "distance"):
+        scene.intersect(output=output, **({} if output == "distance" else {"within": 0.1}))
+    scene.intersect([(0, 1)], "distance", originals=True)
+    scene.first_contact(None, scene.poses)
+    made, batch = [part for part in gc.get_objects() if issubclass(type(part), Operator)], scene.batch()
+    alive = [weakref.ref(part) for part in made if part.batch is batch]
+    del made, batch
+    alive += [weakref.ref(scene.batch()), weakref.ref(scene.batch().states)]
+    gc.collect()
+    gc.disable()
+    try:
+        assert len(alive) == 7
+        scene.add(sample("box"))
+        assert not [ref() for ref in alive if ref() is not None]
+        query = ab.ManifoldQuery(scene, gap=0.1, remember=0.01)
+        query.run()
+        (ref, query) = weakref.ref(query), None
+        assert ref() is None
+    finally:
+        gc.enable()
+
+
+def test_a_pickled_result_holds_the_names_of_its_objects(device):
+    scene = ab.Scene(device)
+    scene.add_many([sample("box")] * 2000, np.tile(STILL, (2000, 1)), worlds=np.arange(2000) // 2)
+    result = scene.intersect([(1, 0), (3, 1900)])
+    for again in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result)):
+        assert again.rows() == result.rows() and again.rows()[1]["second"] == "box 1900"
+        again.check()
+    assert len(pickle.dumps(result)) < 4000
 
 
 def test_results_are_rows_with_names(device, tmp_path):

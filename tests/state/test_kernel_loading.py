@@ -53,6 +53,21 @@ def test_each_kernel_is_loaded_once_beside_other_work(device, monkeypatch):
         assert out.numpy()[0] == 100 + i
 
 
+def test_loading_is_told_of(device, monkeypatch):
+    """By the thread that asked, as kernels come; all are told at the end, of what is loaded already nothing."""
+    told, kernels = [], make_kernels(7)
+    loads_of(monkeypatch, 2)
+    kernel_loading.tell_loading(lambda *counts: told.append((*counts, threading.get_ident())))
+    try:
+        for _ in range(2):
+            with kernel_loading.loading(wp.get_device(device), kernels):
+                pass
+    finally:
+        kernel_loading.tell_loading(None)
+    counts = [done for done, total, thread in told if (total, thread) == (4, threading.get_ident())]
+    assert len(counts) == len(told) > 2 and counts == sorted(counts) and (counts[0], counts[-1]) == (0, 4)
+
+
 def test_one_core_waits_for_the_launches(device, monkeypatch):
     loaded = loads_of(monkeypatch, 1)
     with kernel_loading.loading(wp.get_device(device), make_kernels(2)):

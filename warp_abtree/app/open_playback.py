@@ -62,7 +62,7 @@ def _open_meshes(paths, device, progress, poses, lod) -> MeshPlayback:
 def add_playback_arguments(sub: Parser):
     """Add the arguments that name what is shown."""
     about = "one scene file (.toml) or file of several objects, or meshes and built models (.npz)"
-    sub.add_file("source", nargs="+", metavar="SCENE_OR_MESHES", help=about)
+    sub.add_scene("source", nargs="+", metavar="SCENE_OR_MESHES", help=about)
     about = "pose of the second mesh, again for the third; without it each stands beside the one before, a bit inside"
     sub.add_pose(about, action="append", default=[])
     sub.add_argument("--lod", metavar="LOD", help="LOD of meshes, as for query (finest)")

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from contextlib import contextmanager, suppress
+from threading import get_ident
 
 import warp as wp
 
@@ -15,6 +16,12 @@ AHEAD_THREADS = {"cpu": 2, "cuda": 6}
 
 _asked: set[tuple] = set()
 _first_query: list[Callable] = []
+_told: list[Callable] = []
+
+
+def tell_loading(function: Callable | None):
+    """Have a function told (done, total) while `loading` loads kernels, by the thread that calls it; None ends that."""
+    _told[:] = [] if function is None else [function]
 
 
 def _new_kernels(device, kernels) -> deque:
@@ -34,6 +41,7 @@ def loading(device, kernels, busy: int = 0):
         busy: Cores that other threads keep busy, as `compiling_ahead` says.
     """
     new = _new_kernels(device, kernels)
+    total, done = len(new), []
     threads = min(LOADING_THREADS["cpu" if device.is_cpu else "cuda"], core_count() - 1 - busy, len(new))
 
     def load():
@@ -44,15 +52,25 @@ def loading(device, kernels, busy: int = 0):
                 return
             wp.force_load(device, [module], block_dim)
             _asked.add(key)
+            done.append(key)
+            if get_ident() == caller:
+                tell(len(done))
 
+    def tell(count):
+        for function in _told if total else []:
+            function(count, total)
+
+    caller = get_ident()
     jobs = [workers(threads).submit(load) for _ in range(threads)]
     try:
+        tell(0)
         yield
         if jobs or busy:
             load()
     finally:
         new.clear()
         wait_for(jobs)
+        tell(total)
     for job in jobs:
         job.result()
 

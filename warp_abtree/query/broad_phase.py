@@ -3,6 +3,8 @@
 Worlds never mix, static objects never pair with static ones, and collision groups and masks must allow a pair.
 """
 
+from weakref import proxy
+
 import numpy as np
 import warp as wp
 
@@ -89,7 +91,7 @@ class TileSearch:
     """
 
     def __init__(self, broad_phase: "BroadPhase", group: np.ndarray):
-        self._broad_phase, self.device, count = broad_phase, broad_phase.device, len(group)
+        self._broad_phase, self.device, count = proxy(broad_phase), broad_phase.device, len(group)
         self.tiles, self._lanes = box_tiles.Tiles(), WARP_SIZE if broad_phase.device.is_cuda else 1
         order, most = np.argsort(group, kind="stable").astype(np.int32), 1
         others = count_others(group[order], self._lanes, broad_phase.filter.shared_group)
@@ -150,7 +152,7 @@ class SweepSearch:
     """
 
     def __init__(self, broad_phase: "BroadPhase", group: np.ndarray):
-        self._broad_phase, self.sweep, count = broad_phase, box_sweep.Sweep(), len(group)
+        self._broad_phase, self.sweep, count = proxy(broad_phase), box_sweep.Sweep(), len(group)
         starts = np.concatenate([[0], np.cumsum(np.bincount(group))])
         self.sweep.start = wp.array(starts, dtype=wp.int32, device="cpu")
         self.sweep.order = wp.array(np.argsort(group, kind="stable"), dtype=wp.int32, device="cpu")

@@ -3,6 +3,7 @@
 from contextlib import nullcontext
 from functools import cached_property
 from typing import Any
+from weakref import proxy
 
 import numpy as np
 import warp as wp
@@ -56,7 +57,7 @@ class Readout:
     """
 
     def __init__(self, operator: Any):
-        self.operator, self.device = operator, operator.device
+        self.operator, self.device = proxy(operator), operator.device
         self.packs = operator.regime.packs(self.device)
         self._views: HostViews | None = None
         self._last_read = 0, 0  # pairs of the last result, and its hits

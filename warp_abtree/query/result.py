@@ -43,7 +43,7 @@ def _record_types(real, with_gap):
     vectors: list = [(name, real, (3,)) for name in VECTORS]
     if with_gap:
         vectors.append(("separation", real))
-    means = [("point", real, (3,)), ("normal", real, (3,)), ("travel", real)]
+    means = [("point", real, (3,)), ("normal", real, (3,))]
     return np.dtype([*indices, *vectors, ("coplanar", bool)]), np.dtype([("count", np.int64), *means])
 
 
@@ -178,6 +178,10 @@ class Result(DeviceMemory):
             _ = self.gradient
         return object.__reduce_ex__(self, protocol) if on_host else super().__reduce_ex__(protocol)
 
+    def __getstate__(self):
+        """Return what a pickle holds: names of the objects of its pairs alone."""
+        return {**vars(self), "_names": {i: self._name(i) for i in np.unique(self.pairs).tolist()}}
+
     def check(self):
         """Raise where anything was lost.
 
@@ -219,7 +223,10 @@ class Result(DeviceMemory):
             yield from ((name, _to_host(summary[name])) for name in names if name != "count")
 
     def _name(self, i: int) -> str:
-        return self._names[i] if i < len(self._names) else f"object {i}"
+        try:
+            return self._names[i]
+        except LookupError:
+            return f"object {i}"
 
     def to_csv(self, path):
         """Write `rows` as a table: vectors in columns of their own, as point_x, bracket_0. Waits for the device.

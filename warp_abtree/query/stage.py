@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import Any, NamedTuple
+from weakref import proxy
 
 import numpy as np
 import warp as wp
@@ -64,7 +65,7 @@ class Stage:
 
     def attach(self, operator: Any):
         """Take the operator, whose batch and guard are in place, and make what has no room of its own."""
-        self.operator = operator
+        self.operator = proxy(operator)  # which would wait for the garbage collector in a cycle
 
     def kernels(self, device) -> list:
         """Return the kernels of its first launch with their block sizes, those first that take longest to compile."""

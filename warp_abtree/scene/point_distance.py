@@ -1,8 +1,9 @@
-"""Points against one model: signed distances, nearest points and faces, containment.
+"""Points against a model or a scene: signed distances, nearest points and faces, containment.
 
 A closed surface divides space into inside and outside however it is wound, at every LOD; sides are decided exactly, by
 the parity of the crossings of a ray, as those of solids (`warp_abtree.state.solids`). A distance errs by 2^-45 of the
-sizes of model and point at most; a point on the surface has distance 0, or that error on either side.
+sizes of model and point at most; a point on the surface has distance 0, or that error on either side. In a scene that
+holds of R^T (p - t), the point in the frame of an object that R and t pose, as float64 rounds it.
 """
 
 import weakref
@@ -10,23 +11,27 @@ import weakref
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import check_device, flag, to_numpy
+from warp_abtree.checks.arguments import check_device, flag, to_numpy, whole_number
 from warp_abtree.kernels.inside import point_distance as kernels
 from warp_abtree.model.mesh import COORDINATE_MAX
 from warp_abtree.model.model import Model
 from warp_abtree.model.winding import check_solid
+from warp_abtree.query.request import check_within
 from warp_abtree.scene.objects import check_models
-from warp_abtree.scene.scene import Scene
+from warp_abtree.scene.posed_objects import PosedObjects
 
 # Points of a thread: the next starts from the last one's nearest face.
 RUNS = {"cpu": 256, "cuda": 8}
 # Models whose device arrays are kept for the next call.
 KEPT_MODELS = 4
+OUTPUTS = {"distance": wp.float64, "object": wp.int32, "nearest": wp.vec3d, "face": wp.int32}
 
 _kept: dict[tuple, tuple] = {}
 
 
-def signed_distance(model: Model, points, lod=None, device=None, signed: bool = True, nearest: bool = False):
+def signed_distance(
+    model: Model, points, lod=None, device=None, signed: bool = True, nearest: bool = False, *, within=None
+):
     """Return the distances of points from a model's surface, negative inside. Waits for the device.
 
     Args:
@@ -35,6 +40,8 @@ def signed_distance(model: Model, points, lod=None, device=None, signed: bool = 
         device: Warp device; None for Warp's default.
         signed: Whether insides count; False takes meshes that are not closed, too.
         nearest: Whether to return the nearest points on the surface and their faces as well.
+        within: Distance [model units] up to which the surface is looked for, which takes less time: of points farther
+            away distances are infinite, -inf inside, nearest points NaN, and faces -1. None for no end.
 
     Returns:
         Distances, float64 (n,); with `nearest` also points, float64 (n, 3), and faces of the file, int32 (n,).
@@ -43,7 +50,7 @@ def signed_distance(model: Model, points, lod=None, device=None, signed: bool = 
         TypeError: model is no Model.
         MeshError: The mesh is not closed and has no inside; the message names edges.
         ValueError: Points of another shape, not finite or beyond 2^300, the first is named; a LOD out of range, no such
-            device.
+            device, a bad `within`.
     """
     (model,) = check_models(model, 1)
     if flag(signed, "signed"):
@@ -52,23 +59,44 @@ def signed_distance(model: Model, points, lod=None, device=None, signed: bool = 
     points = _check_points(points)
     scene = _find_scene(model, lod, device)
     check_device(scene.device, "ab.signed_distance")
-    batch, n = scene.batch(), len(points)
-    made = {name: wp.empty(n, dtype=dtype, device=scene.device) for name, dtype in OUTPUTS.items()}
-    if n:
-        rows = wp.array(points, dtype=wp.vec3d, device=scene.device)
-        run = RUNS["cpu" if scene.device.is_cpu else "cuda"]
-        inputs = [run, signed, batch.trees, rows, _sort(points, rows), *made.values()]
-        wp.launch(kernels.measure_point_kernel, -(-n // run), inputs, device=scene.device, block_dim=64)
-    distance, face, point = (array.numpy() for array in made.values())
-    return (distance, point, face) if return_nearest else distance
+    distance, _, *where = _measure(scene, [(0, signed)], points, within)
+    return (distance, *where) if return_nearest else distance
 
 
 def contains(model: Model, points, lod=None, device=None) -> np.ndarray:
     """Return which points lie inside a closed model, bool (n,); arguments and errors are those of `signed_distance`."""
-    return signed_distance(model, points, lod, device) < 0
+    return signed_distance(model, points, lod, device, within=0.0) < 0
 
 
-OUTPUTS = {"distance": wp.float64, "face": wp.int32, "nearest": wp.vec3d}
+def object_distances(scene: PosedObjects, points, world, signed, within, nearest) -> tuple:
+    """Find the distances of points from the objects of a scene, see `Scene.signed_distance`."""
+    check_device(scene.device, "Scene.signed_distance")
+    signed, nearest, points = flag(signed, "signed"), flag(nearest, "nearest"), _check_points(points)
+    world = whole_number(world, "world", -1, 2**31 - 1)
+    objects = np.flatnonzero(scene.present & np.isin(scene.worlds, (world, -1)))
+    if not len(objects):
+        raise ValueError(f"the scene has no object in world {world}")
+    solid = np.array(scene.object_solid)[objects] & signed
+    if signed and not solid.any():
+        raise ValueError("signed: no object is a solid; give solid=True to Scene.add, or signed=False")
+    found = _measure(scene, np.column_stack([objects, solid]), points, within)
+    return found if nearest else found[:2]
+
+
+def _measure(scene, asked, points, within) -> tuple:
+    """Return the outputs of points from objects of a scene, rows of (object, whether it has an inside)."""
+    most = np.inf if within is None else float(check_within(within))
+    batch, n, device = scene.batch(), len(points), scene.device
+    found = kernels.PointDistances()
+    for name, dtype in OUTPUTS.items():
+        setattr(found, name, wp.empty(n, dtype=dtype, device=device))
+    if n:
+        rows = wp.array(points, dtype=wp.vec3d, device=device)
+        run = RUNS["cpu" if device.is_cpu else "cuda"]
+        asked = wp.array(np.asarray(asked, np.int32), dtype=wp.vec2i, device=device)
+        inputs = [run, wp.float64(most), batch.trees, asked, rows, _sort(points, rows), found]
+        wp.launch(kernels.measure_point_kernel, -(-n // run), inputs, device=device, block_dim=64)
+    return tuple(getattr(found, name).numpy() for name in OUTPUTS)
 
 
 def _check_points(points) -> np.ndarray:
@@ -96,9 +124,9 @@ def _sort(points, rows) -> wp.array:
     return order
 
 
-def _find_scene(model, lod, device) -> Scene:
+def _find_scene(model, lod, device) -> PosedObjects:
     """Return a scene of one object at an LOD, which is kept while its model lives, or three others are asked."""
-    scene = Scene(device)
+    scene = PosedObjects(device)
     key = id(model), lod, scene.device.alias
     kept = _kept.pop(key, None)
     if kept is None:

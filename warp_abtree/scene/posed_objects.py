@@ -14,7 +14,7 @@ from warp_abtree.scene.objects import ALL_BITS, ObjectList, check_columns, check
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.lod_update import LodUpdate
-from warp_abtree.state.poses import HostPoses, check_poses, device_rows, place_row, place_rows
+from warp_abtree.state.poses import PoseSetter, check_poses, place_row
 
 
 class PosedObjects(DeviceMemory):
@@ -173,8 +173,8 @@ class PosedObjects(DeviceMemory):
         """Remove objects. Indices of others stay; the next `add` takes the lowest place that is free.
 
         A place without an object keeps its index: the broad phase never pairs it, pairs that name it are refused, and
-        what is given an object goes on having an entry for it, which means nothing: a pose, any LOD, a number. Its
-        model is one of a single triangle. A filter of the object goes with it.
+        what is given an object goes on having an entry for it, which is not read: a pose, a LOD, a number. Its model is
+        one of a single triangle. A filter of the object goes with it.
 
         Args:
             i: Index of an object, or (k,) of them.
@@ -304,26 +304,17 @@ class PosedObjects(DeviceMemory):
         Args:
             poses: (n, 7) x y z qx qy qz qw, quaternions normalised in float64, or (n, 4, 4) rigid matrices taken as
                 they are; float32 or float64 [world units]. An array of any framework; one on the scene's GPU is checked
-                and read there. (synchronization point)
+                and read there. Of a place without an object it is not read. (synchronization point)
 
         Raises:
             ValueError: Wrong shape or count, a number that is not finite, a quaternion or matrix that is no rotation;
                 nothing is changed.
         """
         check_device(self.device, "Scene.set_poses (PoseInput can)")
-        rows = device_rows(poses, self.device)
-        if rows is None:
-            poses = check_poses(poses)
-        given = len(poses) if rows is None else len(rows)
-        if given != self.object_count:
-            raise ValueError(f"poses: {given} given for {self.object_count} objects")
-        pool = self.batch().objects.pool
-        if rows is not None:
-            place_rows(rows, pool)
-            return
+        batch = self.batch()
         if "poses" not in self._kept:
-            self._kept["poses"] = HostPoses(pool, self.device)
-        self._kept["poses"].place(poses)
+            self._kept["poses"] = PoseSetter(batch.objects.pool, self.device, batch.removed)
+        self._kept["poses"].set(poses)
 
     def set_lods(self, lods) -> LodUpdate:
         """Bring every object to a LOD: meshes are refined and trees updated in one batch, states are shared.

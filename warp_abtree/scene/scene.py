@@ -7,6 +7,7 @@ from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.result import Result, contact_dtypes
 from warp_abtree.scene.kept_queries import KeptQueries
 from warp_abtree.scene.penetration import Penetration, find_penetration
+from warp_abtree.scene.point_distance import object_distances
 from warp_abtree.scene.posed_objects import PosedObjects
 from warp_abtree.scene.tree_state import TreeState, read_tree_state
 from warp_abtree.state.batch import check_pairs, exclusion_keys
@@ -170,6 +171,30 @@ class Scene(PosedObjects):
             ValueError: Bad pairs or tolerance, no object, a direction that is 0 or not finite.
         """
         return find_penetration(self, pairs, directions, tolerance)
+
+    def signed_distance(self, points, world=0, signed: bool = True, within=None, nearest: bool = False) -> tuple:
+        """Return the distances of points from the objects, negative inside solids, and which is nearest. Waits.
+
+        The distance of a point is the least signed one of all objects: inside a solid, how deep; else how far to the
+        nearest surface, at the objects' LODs.
+
+        Args:
+            points: (n, 3) [world units], of any framework.
+            world: The objects of which world are asked, those of world -1 among them.
+            signed: Whether the insides of solids count.
+            within: Distance [world units] up to which surfaces are looked for, which takes less time: of points farther
+                away distances are infinite, -inf inside, nearest points NaN, faces -1, and outside objects too.
+            nearest: Whether to return the nearest points on the surfaces and their faces as well.
+
+        Returns:
+            Distances, float64 (n,), and objects, int32 (n,); with `nearest` also points [world units], float64 (n, 3),
+            and faces of the object's file, int32 (n,).
+
+        Raises:
+            ValueError: Points of another shape, not finite or beyond 2^300, the first is named; a bad `within`; no
+                object in that world; or signed, and none of them is a solid.
+        """
+        return object_distances(self, points, world, signed, within, nearest)
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.

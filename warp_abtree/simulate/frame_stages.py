@@ -136,7 +136,7 @@ class FrameStages:
         poses = None if self._find_poses is None else self._find_poses(time, out=self._memory)
         if poses is None:
             return None
-        rows = check_poses(poses)
+        rows = check_poses(poses, removed=self.scene.batch().removed)
         if rows.shape != self._memory.shape:
             raise ValueError(f"motion: poses of shape {rows.shape}, not {self._memory.shape}")
         return rows

@@ -22,14 +22,16 @@ POSE_TYPES = {
     wp.mat44d: (wp.float64, 16),
 }
 NONE_BAD = 2**31 - 1
+IDENTITY_POSE = (0, 0, 0, 0, 0, 0, 1)
 IDENTITY, LAST_ROW = np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
 
 
-def check_poses(poses, what="poses", first=0) -> np.ndarray:
+def check_poses(poses, what="poses", first=0, removed=()) -> np.ndarray:
     """Return poses as float64, (n, 7) or (n, 4, 4).
 
     Args:
         first: Number of the first pose, for messages.
+        removed: Places that have no object, rising: their poses are not read, but the identity.
 
     Raises:
         ValueError: Another shape, a number that is not finite, a quaternion whose norm is off by more than 1e-3, a
@@ -39,6 +41,8 @@ def check_poses(poses, what="poses", first=0) -> np.ndarray:
     if not (poses.ndim == 2 and poses.shape[1] == 7) and not (poses.ndim == 3 and poses.shape[1:] == (4, 4)):
         raise ValueError(f"{what}: shape {poses.shape} is neither (n, 7) nor (n, 4, 4)")
     poses = poses.astype(np.float64)
+    if len(removed) and len(poses) > removed[-1]:
+        poses[removed] = IDENTITY_POSE if poses.ndim == 2 else np.eye(4)
     sound = np.isfinite(poses).all(tuple(range(1, poses.ndim)))
     if not sound.all():
         raise ValueError(f"{what}: pose {first + sound.argmin()} is not finite")
@@ -129,19 +133,40 @@ def place_rows(rows, pool, tolerance=QUATERNION_TOLERANCE):
         wp.synchronize_stream(wp.get_stream(rows.device))
 
 
-class HostPoses:
-    """Checked poses of the host on their way to the objects of a pool: memory and launches are made once.
+class PoseSetter:
+    """Sets all objects of a pool from poses that a caller hands in: memory and launches are made once.
 
     Args:
         pool: `ObjectPool` whose arrays stay.
+        removed: Places without an object, rising: what is given for them is not read.
+        what: What errors call the poses.
     """
 
-    def __init__(self, pool, device):
-        self._pool, self._device = pool, device
+    def __init__(self, pool, device, removed=(), what="poses"):
+        self._pool, self._device, self._removed, self._what = pool, device, list(removed), what
         self._made: dict = {}  # rows, their view on the host, and the launch, by numbers a pose
 
-    def place(self, poses: np.ndarray):
-        """Set all objects from poses float64, (n, 7) or (n, 4, 4). One launch: all of them move, or none."""
+    def set(self, poses):
+        """Set the objects from poses (n, 7) or (n, 4, 4), which are read where they lie. (synchronization point)
+
+        Raises:
+            ValueError: As `check_poses`, or another number of poses than of objects; nothing is changed.
+        """
+        rows, count = device_rows(poses, self._device, self._what), len(self._pool.position)
+        given = check_poses(poses, self._what, removed=self._removed) if rows is None else rows
+        if len(given) != count:
+            raise ValueError(f"{self._what}: {len(given)} given for {count} objects")
+        if rows is not None:
+            try:
+                return place_rows(rows, self._pool)
+            except ValueError:
+                if not self._removed:
+                    raise
+            given = check_poses(poses, self._what, removed=self._removed)
+        self._place(given)
+
+    def _place(self, poses: np.ndarray):
+        """Set all objects from checked poses, float64 (n, 7) or (n, 4, 4). One launch: all of them move, or none."""
         given = poses.reshape(len(poses), -1)
         width = given.shape[1]
         if width not in self._made:

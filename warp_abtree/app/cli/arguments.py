@@ -3,6 +3,8 @@
 import argparse
 import re
 
+from warp_abtree.app.toml.folder import scene_names
+
 PROGRAM = "warp-abtree"
 EXIT_STATUS = """\
 exit status:
@@ -15,6 +17,7 @@ exit status:
 MESHES = 'a mesh file, gzipped or not, or "warp:bunny", "warp:bear", "warp:rocks"'
 LOD_HELP = "a number with a dot is a fraction of the faces in (0, 1], a whole number a LOD, or tol:X, finest, coarsest"
 PRECISION_NAMES = ("exact", "float32")
+SCENES_FUNCTION = "_warp_abtree_scenes"  # of the completion scripts
 _NEGATIVE = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|^-(inf|nan)$")
 
 
@@ -30,8 +33,16 @@ class Parser(argparse.ArgumentParser):
         try:
             import shtab
         except ImportError:
-            return
+            return action
         action.complete = shtab.FILE  # type: ignore[attr-defined]
+        return action
+
+    def add_scene(self, *names, **options):
+        """Add an argument that is a file or the name of a scene of the package, which shells complete."""
+        action = self.add_file(*names, **options)
+        if hasattr(action, "complete"):
+            action.complete = {**action.complete, **dict.fromkeys(("bash", "zsh"), SCENES_FUNCTION)}
+            action.complete["fish"] = " ".join(("(__fish_complete_path)", *scene_names()))
 
     def add_pose(self, about: str, **options):
         """Add `--pose`, a position and a quaternion."""
@@ -70,12 +81,16 @@ def milliseconds(text) -> float:
 
 
 class PrintCompletion(argparse.Action):
-    """Print the script by which a shell completes commands, options and files."""
+    """Print the script by which a shell completes commands, options, files and scenes."""
 
     def __call__(self, parser, namespace, values, option_string=None):
         try:
             import shtab
         except ImportError:
             raise ValueError(f"{option_string} needs shtab: pip install shtab") from None
-        print(shtab.complete(parser, values))
+        scenes = " ".join(scene_names())
+        bash = f'compgen -W "{scenes}" -- "$1"; compgen -f -- "$1"'
+        bodies = {"bash": bash, "zsh": f"_alternative 'scenes:scene:({scenes})' 'files:file:_files'"}
+        preamble = {shell: f"{SCENES_FUNCTION}() {{ {body}; }}" for shell, body in bodies.items()}
+        print(shtab.complete(parser, values, preamble=preamble.get(values, "")))
         parser.exit()

@@ -25,6 +25,7 @@ from warp_abtree.app.cli.arguments import EXIT_STATUS, PROGRAM, Parser, PrintCom
 from warp_abtree.app.cli.progress import Progress, compile_notice, start_warp
 from warp_abtree.app.pictures import command as picture_command
 from warp_abtree.app.viewer import command as view_command
+from warp_abtree.checks.kernel_loading import tell_loading
 from warp_abtree.checks.signals import handle_signals, not_swallowed
 from warp_abtree.checks.version import __version__
 
@@ -98,7 +99,8 @@ def main(argv=None) -> int:
         if rest:
             raise ValueError(f"unrecognized arguments: {' '.join(rest)} (see {PROGRAM} {options.command} --help)")
         start_warp()
-        with compile_notice():
+        tell_loading(progress.compiling if sys.stderr.isatty() else None)
+        with compile_notice(progress=progress):
             status = options.function(options, progress) or 0
         sys.stdout.flush()
     except BrokenPipeError:

@@ -13,6 +13,7 @@ import warp as wp
 ESTIMATE_DELAY = 5.0  # seconds of a stage before its first estimate
 YEAR = 366 * 86400  # seconds
 NOTICE_DELAY = 1.5  # seconds of compiling before a word about it
+COMPILING = "compiling kernels"
 
 
 class Progress:
@@ -49,6 +50,12 @@ class Progress:
             bar, task = self._bar
             bar.update(task, completed=done, total=max(total, 1), refresh=True)
 
+    def compiling(self, done, total):
+        """Show how many kernels are loaded, as `tell_loading` asks for."""
+        self(COMPILING, done, total)
+        if done >= total:
+            self.close()
+
     def _estimate(self, done, total, spent):
         """Say how much is done, if that was not said for as long as the stage had taken then."""
         if 0 < done < total and spent >= 2 * self._told:
@@ -73,7 +80,8 @@ def _start_bar(stream, stage):
     except ImportError:
         return None
     # No thread of its own redraws it: that would take time from frames that are being timed.
-    bar = progress.Progress(console=Console(file=stream), transient=True, auto_refresh=False)
+    columns = *progress.Progress.get_default_columns(), progress.MofNCompleteColumn(separator=" of ")
+    bar = progress.Progress(*columns, console=Console(file=stream), transient=True, auto_refresh=False)
     bar.start()
     return bar, bar.add_task(stage)
 
@@ -97,8 +105,8 @@ def start_warp():
 
 
 @contextlib.contextmanager
-def compile_notice(stream=None, delay=NOTICE_DELAY):
-    """Say once on stderr that kernels are being compiled, if that takes longer than a moment."""
+def compile_notice(stream=None, delay=NOTICE_DELAY, progress=None):
+    """Say once on stderr that kernels are being compiled, if that takes longer than a moment and no bar shows it."""
     finished = threading.Event()
 
     def compiling():
@@ -112,7 +120,7 @@ def compile_notice(stream=None, delay=NOTICE_DELAY):
         busy = 0.0
         while not finished.wait(0.25):
             busy += 0.25 * compiling()
-            if busy > delay:
+            if busy > delay and not (progress and progress.stage == COMPILING):
                 print("compiling kernels for this machine; later runs find them in a cache", file=stream or sys.stderr)
                 return
 

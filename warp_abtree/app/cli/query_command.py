@@ -9,13 +9,19 @@ import numpy as np
 from warp_abtree.app.cli.arguments import LOD_HELP, MESHES, PRECISION_NAMES, Parser
 from warp_abtree.app.cli.model_commands import diagonal_of, load_model, lod_at
 from warp_abtree.app.cli.report import check_output, print_result, show_number
+from warp_abtree.app.toml.folder import find_scene
+from warp_abtree.app.toml.scene_file import load_scene
 from warp_abtree.checks.atomic_write import atomic_write
+from warp_abtree.interop.scenes import is_assembly
 from warp_abtree.model.files.found import MeshError
+from warp_abtree.query.result import RESULT_ARRAYS
 from warp_abtree.scene.scene import Scene
+from warp_abtree.state.poses import IDENTITY_POSE
 
-SUMMARY = "intersect two meshes, A at the origin and B at a pose"
+SUMMARY = "intersect two meshes, A at the origin and B at a pose, or all objects of a scene"
 EXAMPLES = (
-    "warp:bear warp:bunny --pose 0.2 0 0 0 0 0 1",
+    "warp:bear warp:bunny --pose 2 2 0 0 0 0 1",
+    "bunny_tori --output distance --beyond 0.2 --record pairs.csv",
     "bunny.npz bunny.npz --pose -0.5 0 0 0 0 0 1 --lod-a 0.25 --lod-b tol:0.01 --output faces --json",
     "bunny.npz bunny.npz --pose 0.2 0 0 0 0 0 1 --output contacts --record contacts.csv",
     "bunny.npz bunny.npz --pose 2 0 0 0 0 0 1 --output distance --json",
@@ -27,12 +33,12 @@ DISTANCE_OPTIONS = ("tolerance", "relative", "beyond", "originals", "signed")
 
 def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
-    sub.add_file("a", metavar="A", help=f"{MESHES}, or a model that build wrote (.npz)")
-    sub.add_file("b", metavar="B", help="the same")
-    identity = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
-    sub.add_pose("pose of B in the frame of A: position and unit quaternion (0 0 0 0 0 0 1)", default=identity)
-    sub.add_argument("--lod-a", default="finest", metavar="LOD", help=f"LOD of A: {LOD_HELP} (finest)")
-    sub.add_argument("--lod-b", default="finest", metavar="LOD", help="the same for B (finest)")
+    about = f"{MESHES}, or a model that build wrote (.npz); alone a scene file (.toml) or file of several objects"
+    sub.add_scene("a", metavar="A", help=about)
+    sub.add_file("b", metavar="B", nargs="?", help="a mesh or model; with a scene none")
+    sub.add_pose("pose of B in the frame of A: position and unit quaternion (0 0 0 0 0 0 1)")
+    sub.add_argument("--lod-a", metavar="LOD", help=f"LOD of A: {LOD_HELP} (finest)")
+    sub.add_argument("--lod-b", metavar="LOD", help="the same for B (finest)")
     sub.add_argument("--output", choices=OUTPUTS, default="count", help="what to ask (count)")
     about = "signs of determinants: exact, or of the rounded ones (exact)"
     sub.add_argument("--precision", choices=PRECISION_NAMES, default="exact", help=about)
@@ -44,24 +50,22 @@ def add_arguments(sub: Parser):
     sub.add_argument("--originals", action="store_true", default=None, help=about)
     about = "negative distances, as deep as the deepest point of one solid in the other"
     sub.add_argument("--signed", action="store_true", default=None, help=about)
-    sub.add_argument("--solid", action="store_true", help="what lies inside A or B, closed meshes, intersects it")
-    about = "write face pairs and contacts as .csv, or the whole result as .npz"
+    about = "what lies inside A or B, or objects of the scene, closed meshes, intersects it"
+    sub.add_argument("--solid", action="store_true", help=about)
+    about = "write face pairs and contacts as .csv, of a scene its object pairs, or the whole result as .npz"
     sub.add_file("--record", type=Path, metavar="FILE", help=about)
 
 
 def query(options, progress):
-    """Intersect two meshes at a pose and two LODs."""
+    """Intersect two meshes at a pose and two LODs, or the objects of a scene."""
     if options.record:
-        check_output(options.record, [".csv", ".npz"], inputs=(options.a, options.b))
-        if options.record.suffix.lower() == ".csv" and options.output not in ("faces", "contacts"):
-            raise ValueError(f"{options.record}: a row is a face pair; ask --output faces or contacts, or write .npz")
+        check_output(options.record, [".csv", ".npz"], inputs=filter(None, (options.a, options.b)))
+    if options.b is None:
+        return _query_scene(options, progress)
+    if options.record and options.record.suffix.lower() == ".csv" and options.output not in ("faces", "contacts"):
+        raise ValueError(f"{options.record}: a row is a face pair; ask --output faces or contacts, or write .npz")
     scene, models = _make_scene(options, progress)
-    pair = np.array([[0, 1]])
-    asked = {"output": options.output, **_list_options(options)}
-    scene.intersect(pair, **asked)  # loads the kernels, so that the time below is the query's
-    begin = time.perf_counter()
-    found = scene.intersect(pair, **asked)
-    spent = 1e3 * (time.perf_counter() - begin)
+    found, spent = _ask(scene, np.array([[0, 1]]), options)
     lods = scene.lods.tolist()
     result = {
         "intersects": bool(found.any[0]),
@@ -93,6 +97,46 @@ def query(options, progress):
     print_result(result, options.json)
 
 
+def _ask(scene, pairs, options):
+    """Return what pairs are found, and the time that it takes [ms]."""
+    asked = {"output": options.output, **_list_options(options)}
+    scene.intersect(pairs, **asked)  # loads the kernels, so that the time below is the query's
+    begin = time.perf_counter()
+    found = scene.intersect(pairs, **asked)
+    return found, 1e3 * (time.perf_counter() - begin)
+
+
+def _query_scene(options, progress):
+    """Ask the pairs of a scene that are near one another."""
+    for name in ("pose", "lod_a", "lod_b"):
+        if getattr(options, name) is not None:
+            raise ValueError(f"--{name.replace('_', '-')}: for two meshes; {options.a} says where its objects are")
+    path = find_scene(options.a)
+    if path.suffix.lower() != ".toml" and not (path.is_file() and is_assembly(path)):
+        raise ValueError(f"{options.a}: B is missing; alone stands a scene file or a file of several objects")
+    scene = load_scene(options.a, device=options.device, progress=progress).scene
+    progress.close()
+    for i in np.flatnonzero(scene.present).tolist() if options.solid else []:
+        scene.change(i, solid=True)
+    found, spent = _ask(scene, None, options)
+    if options.record and options.record.suffix.lower() == ".csv":
+        found.to_csv(options.record)
+    elif options.record:
+        record_found(found, options.record)
+    result = {
+        "scene": options.a,
+        "objects": scene.object_count,
+        "near": len(found),
+        "intersecting": int(found.any.sum()),
+        "milliseconds": spent,
+        "device": str(scene.device),
+        "precision": options.precision,
+        "written": [str(options.record)] if options.record else [],
+        "pairs": found.rows(),
+    }
+    print_result(result, options.json)
+
+
 def _list_options(options) -> dict:
     """Return the options of an output; raise ValueError for one of another."""
     of_distance = {name: getattr(options, name) for name in DISTANCE_OPTIONS if getattr(options, name) is not None}
@@ -111,10 +155,11 @@ def _make_scene(options, progress):
     models = [load_model(options.a, progress)]
     models.append(models[0] if options.b == options.a else load_model(options.b, progress))
     progress.close()
-    lods = lod_at("--lod-a", models[0], options.lod_a), lod_at("--lod-b", models[1], options.lod_b)
+    named = zip(("--lod-a", "--lod-b"), models, (options.lod_a, options.lod_b))
+    lods = [lod_at(name, model, lod or "finest") for name, model, lod in named]
     scene.add(models[0], lod=lods[0], solid=options.solid)
     try:
-        scene.add(models[1], pose=options.pose, lod=lods[1], solid=options.solid)
+        scene.add(models[1], pose=options.pose or IDENTITY_POSE, lod=lods[1], solid=options.solid)
     except MeshError:
         raise
     except ValueError as error:
@@ -133,7 +178,7 @@ def record_found(found, path: Path):
     if there is one; the summary over an object pair has no place there.
     """
     if path.suffix.lower() == ".npz":
-        names = ("any", "count", "faces", "contacts", "pair_contacts", "distance", "bracket", "points", "point_faces")
+        names = (*RESULT_ARRAYS, "count")
         arrays = {name: getattr(found, name) for name in names if getattr(found, name) is not None}
         with atomic_write(path) as file:
             np.savez(file, **arrays)

@@ -10,6 +10,7 @@ import numpy as np
 from warp_abtree.checks.atomic_write import is_special
 
 LISTED = 20  # rows of a table that are printed
+MEASURED = ("milliseconds", "seconds")  # of which three digits are more than is sure
 
 
 def plain(value):
@@ -25,8 +26,11 @@ def plain(value):
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def print_result(result: dict, as_json: bool):
-    """Print a result as JSON, or a line for each value and a table for each list or dictionary of rows."""
+def print_result(result: dict, as_json: bool, digits=6):
+    """Print a result as JSON, or a line for each value and a table for each list or dictionary of rows.
+
+    Numbers that are not whole have so many digits, but in JSON.
+    """
     if as_json:
         print(json.dumps(plain(result), indent=1, allow_nan=False))
         return
@@ -38,24 +42,24 @@ def print_result(result: dict, as_json: bool):
         if rows and (isinstance(value, np.ndarray) or isinstance(value[0], dict)):
             print(f"\n{heading}:")
             table = [list(row.values()) if isinstance(row, dict) else row for row in value[:LISTED]]
-            print_table([*([list(value[0])] if isinstance(value, list) else []), *table])
+            print_table([*([list(value[0])] if isinstance(value, list) else []), *table], digits)
             print(f"and {rows - LISTED:,} more; --json lists all\n" if rows > LISTED else "")
-        elif value is not None:
-            print(f"{heading:<24}{_shown(value)}")
+        elif value is not None and not (isinstance(value, list) and not value):
+            print(f"{heading:<24}{_shown(value, 3 if key in MEASURED else digits)}")
 
 
-def _shown(value) -> str:
+def _shown(value, digits) -> str:
     """Return a value as people read it."""
     if isinstance(value, dict):
-        return ", ".join(f"{key.replace('_', ' ')} {_shown(entry)}" for key, entry in value.items())
+        return ", ".join(f"{key.replace('_', ' ')} {_shown(entry, digits)}" for key, entry in value.items())
     if isinstance(value, np.ndarray) and value.dtype.kind == "f" and np.isnan(value).all():
         return "none"
     if isinstance(value, list | tuple | np.ndarray):
-        return " ".join(map(_shown, value))
+        return " ".join(_shown(entry, digits) for entry in value)
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     if isinstance(value, float | np.floating):
-        return show_number(value)
+        return show_number(value, digits)
     return f"{value:,}" if isinstance(value, int | np.integer) else "" if value is None else str(value)
 
 
@@ -68,9 +72,9 @@ def show_number(value, digits=6) -> str:
     return f"{value:.{max(digits, whole + digits - 4)}g}"
 
 
-def print_table(rows):
+def print_table(rows, digits=6):
     """Print rows of values, aligned to the left."""
-    rows = [[_shown(value) for value in row] for row in rows]
+    rows = [[_shown(value, digits) for value in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*rows)]
     for row in rows:
         print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths)).rstrip())

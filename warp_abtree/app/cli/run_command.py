@@ -30,7 +30,7 @@ PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg", ".webp", ".gif")
 def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
     about = f"scene file (.toml), file of several objects, or one of {', '.join(scene_names())}"
-    sub.add_file("scene", metavar="SCENE", help=about)
+    sub.add_scene("scene", metavar="SCENE", help=about)
     sub.add_argument("--frames", type=positive_count, metavar="N", help="frames to run (the scene's own number)")
     sub.add_file("--picture", type=Path, metavar="PNG", help="draw the scene, intersecting faces coloured")
     sub.add_argument(
@@ -80,7 +80,7 @@ def run(options, progress):
         "written": written,
         **frame.summary(),
     }
-    print_result(summary, options.json)
+    print_result(summary, options.json, digits=4)
     budget, least = summary["budget_ms"], summary["coarsest_ms"]
     if budget is not None and least is not None and least > budget:
         about = f"a budget of {budget:g} ms is impossible here: with every object at its coarsest LOD frames take"

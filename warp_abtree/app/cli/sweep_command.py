@@ -24,7 +24,7 @@ EXAMPLES = (
 
 def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
-    sub.add_file(
+    sub.add_scene(
         "source",
         nargs="+",
         metavar="SCENE_OR_MODELS",

@@ -254,6 +254,7 @@ def _add_objects(path, scene, groups, models):
                 table.collision_group,
                 table.collision_mask,
                 table.solid,
+                None if table.name is None else [table.name + (f" {k}" if k else "") for k in range(len(poses))],
             )
         except MeshError as error:
             fail(path, f"{group.key}.solid", error)

@@ -192,7 +192,7 @@ class ObjectTable(Table, kw_only=True):
     """[[objects]]: one object, or many."""
 
     model: str | NonEmpty[str]  # of a list each in turn
-    name: str | None = None  # for lod_sweep
+    name: str | None = None  # in results, of several the second and later ones with a number, and for lod_sweep
     position: Vector = ORIGIN
     rotation: RotationTable | None = None
     world: Annotated[int, Meta(ge=-1, le=2**30)] = 0  # objects of different worlds never meet; -1 is in every world

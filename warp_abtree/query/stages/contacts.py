@@ -45,18 +45,8 @@ contacts of each chunk of 32, the last chunk perhaps shorter, from left to right
   either surface.
 * normal: mean of the normals, weighted as the points, at unit length. A mean shorter than 2^-20, as of curves that run
   around an object, gives way to the direction between the models' centres.
-* travel: an estimate of how far the second object would have to move along the normal to come free. The contact curve
-  encloses an area, seen along the normal; its faces say how fast that area shrinks with such a motion; travel is their
-  quotient, at most the overlap of the two root boxes along the normal, which it is too where the area does not shrink.
-  Without an area (points, shared planes) it is the overlap along the normal of the faces that touch. For a box pressed
-  straight into a larger one it is exact up to the rounding of the root boxes, float32 and outwards: 3e-7 for boxes of 4
-  units, so that boxes that only touch have that travel. At most (2 r + d) / 2 d times the truth for balls of radius r
-  at distance d, less where the root boxes cap it; half of it for the tip of a cone. It is no depth, and no bound
-  on one: where a curve runs over the edge of an object the mean normal leans over, and travel can be several times too
-  large; for separate regions of contact, such as a peg in its hole, and for open surfaces it is merely a length. Depths
-  of solids are measured by `signed` distances (`query.stages.distance`).
 
-A pair without contacts has travel 0 and NaN as point and normal, of the bits 0x7ff8000000000000. The results are the
+A pair without contacts has NaN as point and normal, of the bits 0x7ff8000000000000. The results are the
 same, bit for bit, on CPU and CUDA. For a pair named the other way the contacts differ in nothing but order, exchanged
 ends and signs; sums follow the order of the faces as named, so that its summary may differ in the last bits too.
 """
@@ -119,7 +109,7 @@ class ContactStage(Stage):
         # As many of one and of the other as there are contacts at most: one array has room for both.
         self._listed_totals = wp.zeros(2, dtype=wp.int32, device=operator.device)
         self.deferred.total, self._near.total = self._listed_totals[:1], self._listed_totals[1:]
-        self.sort = HitSort(operator)
+        self.sort = HitSort(self.operator)
 
     def kernels(self, device) -> list:
         """Return what finds contacts, and what sorts."""
@@ -127,7 +117,7 @@ class ContactStage(Stage):
             finding = contact.find_pair_contacts_kernel, contact.find_deferred_kernel
             sums = [(summary.sum_pair_kernel, 256)] if self._sums_contacts else []
             return [*((kernel, WARP_SIZE) for kernel in finding), *sums, (sort_hits.sort_by_pair_kernel, 256)]
-        finding = contact.find_contact_kernel, summary.sum_loop_kernel
+        finding = contact.find_contact_kernel, summary.sum_mean_kernel
         return [*((kernel, WARP_SIZE) for kernel in finding), *first_sort(device)]
 
     def arrays(self, rooms: Rooms) -> list[Array]:
@@ -147,14 +137,17 @@ class ContactStage(Stage):
             Array(self, "key", wp.int64, 2 * hits),
             Array(self, "order", wp.int32, 2 * hits),
             Array(self, "start", wp.int32, pairs + 1, 0),
-            *fields(self.pair_contacts, pairs, point=wp.vec3d, normal=wp.vec3d, travel=wp.float64),
-            Array(self._sums, "middle", wp.vec3d, pairs),
+            *fields(self.pair_contacts, pairs, point=wp.vec3d, normal=wp.vec3d),
         ]
         if self._with_gap:
             made.append(Array(self.contacts, "separation", wp.float64, hits))
-        numbers = dict.fromkeys(("length", "crossed", "area", "change", "front", "back"), wp.float64)
         count = self._chunk_count(hits, pairs)
-        return [*made, *fields(self._sums, count, span=wp.vec3i, point=wp.vec3d, normal=wp.vec3d, **numbers)]
+        return [
+            *made,
+            *fields(
+                self._sums, count, span=wp.vec3i, length=wp.float64, crossed=wp.float64, point=wp.vec3d, normal=wp.vec3d
+            ),
+        ]
 
     def link(self):
         """Let both lists of contacts share their array, and give the operator what users read."""
@@ -218,14 +211,13 @@ class ContactStage(Stage):
     def _reduce(self, count: int):
         operator, room, means = self.operator, self.operator.rooms.pairs, self.pair_contacts
         count, sums = self._chunk_count(count, room), self._sums
-        given = [operator.batch.trees, operator.pair_batch, self.start, self.faces, self.contacts]
+        given = [operator.batch.trees, operator.pair_batch, self.start, self.contacts]
         if not operator.uses_warps():
             operator.launch_kernel(summary.sum_pair_kernel, room, [*given, means])
             return
         operator.launch_warps(summary.sum_length_kernel, count, [self.start, self.contacts, sums])
         operator.launch_warps(summary.sum_mean_kernel, count, [self.start, self.contacts, sums])
-        operator.launch_warps(summary.sum_loop_kernel, count, [*given, sums, means])
-        operator.launch_warps(summary.measure_travel_kernel, room, [*given, sums, means])
+        operator.launch_warps(summary.average_contacts_kernel, room, [*given, sums, means])
 
     def read(self, found: Found, device: bool, with_rows: bool):
         """Read contacts and summaries."""
@@ -247,7 +239,7 @@ class ContactStage(Stage):
         found.faces = self.faces.numpy()[:count].reshape(-1, 3).copy()
         found.pair_contacts["count"] = found.count
         with np.errstate(over="ignore"):
-            for name in ("point", "normal", "travel"):
+            for name in ("point", "normal"):
                 found.pair_contacts[name] = getattr(self.pair_contacts, name).numpy()[:pairs]
             for name in face_type.names[2:]:
                 found.contacts[name] = getattr(self.contacts, name).numpy()[:count]
@@ -280,7 +272,6 @@ class ContactStage(Stage):
         types = {"pair": wp.int32, "faces": wp.vec2i, **dict.fromkeys(VECTORS, vector), "coplanar": wp.bool}
         found.contacts = {name: self._empty(count, dtype) for name, dtype in types.items()}
         means = {"point": self._empty(pairs, vector), "normal": self._empty(pairs, vector)}
-        means["travel"] = self._empty(pairs, real)
         self._launch(pack.contact_copier(real), count, [self.faces, self.contacts, *found.contacts.values()])
         if self._with_gap:
             separation = found.contacts["separation"] = self._empty(count, real)

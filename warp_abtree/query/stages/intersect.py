@@ -1,5 +1,7 @@
 """ACTIVE-INTERSECT for a batch: `Query`, and the stages that find which object pairs intersect, or are proved apart."""
 
+from weakref import proxy
+
 import numpy as np
 import warp as wp
 
@@ -72,7 +74,7 @@ class IntersectStage(HitStage):
         super().attach(operator)
         if self._with_gap:
             self.hits.apart_total = wp.zeros(1, dtype=wp.int32, device=operator.device)
-        self.traversal = Traversal(operator, self._output == int(face_pairs.OUTPUT_ANY))
+        self.traversal = Traversal(self.operator, self._output == int(face_pairs.OUTPUT_ANY))
         self._no_distance = wp.empty(0, dtype=wp.float64, device=operator.device)
         operator.hits, operator.traversal, operator.lists_hits = self.hits, self.traversal, self._reads
         operator.lists_apart = self._slots is not None
@@ -127,7 +129,7 @@ class ApartStage(HitStage):
 
     def __init__(self, within):
         super().__init__()
-        self.distance = PairDistance("within", within, self, "within")
+        self.distance = PairDistance("within", within, proxy(self), "within")
 
     def attach(self, operator: Operator):
         """Take the operator, and give it the proofs."""

@@ -38,7 +38,7 @@ from warp_abtree.query.stages.distance import PAIRS_A_CORE
 from warp_abtree.query.stages.inside import InsideStage
 from warp_abtree.query.stages.intersect import IntersectStage
 from warp_abtree.query.staging import first_rows
-from warp_abtree.state.poses import HostPoses, check_poses, device_rows, place_rows
+from warp_abtree.state.poses import PoseSetter
 
 CONTACT_COUNTERS = 4
 TOLERANCE_LEAST = 2.0**-40
@@ -225,7 +225,7 @@ class FirstContactQuery(Operator):
         *_, self._motions = stages
         self.contacts, self.ends = self._motions.contacts, self._motions.ends
         super().__init__(scene, stages, pairs, capacity, sort_pairs=True)
-        self._host_ends = HostPoses(self.ends, self.device)
+        self._end_setter = PoseSetter(self.ends, self.device, self.batch.removed, "end_poses")
         if end_poses is not None:
             self.set_end_poses(end_poses)
 
@@ -258,14 +258,7 @@ class FirstContactQuery(Operator):
             ValueError: As `Scene.set_poses`; nothing is changed.
         """
         check_device(self.device, "giving a query end poses")
-        rows = device_rows(end_poses, self.device, "end_poses")
-        poses = check_poses(end_poses, "end_poses") if rows is None else rows
-        if len(poses) != self.batch.object_count:
-            raise ValueError(f"end_poses: {len(poses)} given for {self.batch.object_count} objects")
-        if rows is None:
-            self._host_ends.place(poses)
-        else:
-            place_rows(rows, self.ends)
+        self._end_setter.set(end_poses)
 
     def set_options(self, tolerance=1e-6, screw=False):
         """Take another tolerance, and screws or not, from the next launch on; a captured graph keeps its own.
