@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.device_memory import DeviceMemory
+from warp_abtree.checks.radix_sort import radix_sort
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.intersect import box_sweep, box_tiles
@@ -140,8 +141,7 @@ class TileSearch:
             launch()
 
     def _sort(self):
-        with wp.ScopedDevice(self.device):
-            wp.utils.radix_sort_pairs(self._key, self.tiles.order, len(self._key) // 2, end_bit=self._key_bits)
+        radix_sort(self._key, self.tiles.order, len(self._key) // 2, self._key_bits)
 
 
 class SweepSearch:
@@ -258,9 +258,8 @@ class BroadPhase(DeviceMemory):
         room = len(self.pairs)
         inputs = [self.pair_count, self.pairs, self.order, self.key]
         wp.launch(kernels.make_pair_key_kernel, room, inputs, device=self.device)
-        with wp.ScopedDevice(self.device):
-            # The key behind all others has only ones among these bits.
-            wp.utils.radix_sort_pairs(self.key, self.order, room, end_bit=32 + len(self.lower).bit_length())
+        # The key behind all others has only ones among these bits.
+        radix_sort(self.key, self.order, room, 32 + len(self.lower).bit_length())
         inputs = [self.key, self.pair_count, self.pairs]
         wp.launch(kernels.place_pair_kernel, room + 1, inputs, device=self.device)
 

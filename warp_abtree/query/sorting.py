@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.radix_sort import radix_sort
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.io import sort_hits, sort_segments
 from warp_abtree.query.staging import first_rows
@@ -136,8 +137,7 @@ class HitSort:
         )
         for launch, widths in zip(makers, passes, strict=True):
             launch()
-            with wp.ScopedDevice(operator.device):
-                wp.utils.radix_sort_pairs(key, order, count, end_bit=sum(widths))
+            radix_sort(key, order, count, sum(widths))
         placer()
         return False
 

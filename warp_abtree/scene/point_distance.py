@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, flag, to_numpy, whole_number
+from warp_abtree.checks.radix_sort import radix_sort
 from warp_abtree.kernels.inside import point_distance as kernels
 from warp_abtree.model.mesh import COORDINATE_MAX
 from warp_abtree.model.model import Model
@@ -120,7 +121,7 @@ def _sort(points, rows) -> wp.array:
     code, order = (wp.empty(2 * len(points), dtype=wp.int32, device=rows.device) for _ in range(2))
     inputs = [wp.vec3d(lower), wp.float64(cell or 1.0), rows, code, order]
     wp.launch(kernels.code_point_kernel, len(points), inputs, device=rows.device)
-    wp.utils.radix_sort_pairs(code, order, len(points))
+    radix_sort(code, order, len(points), 32)
     return order
 
 

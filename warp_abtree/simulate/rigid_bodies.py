@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import finite_array, flag, positive
+from warp_abtree.checks.radix_sort import radix_sort
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.base.arrays import LAST_KEY
@@ -247,8 +248,7 @@ class Dynamics(RigidBodies):
             for kernel in (graph_coloring.bid_kernel, graph_coloring.assign_color_kernel):
                 self._launch(kernel, room, [turn, self.query.pair_batch, color, self.bodies])
         wp.copy(self._sorted_color, color, count=room)
-        with wp.ScopedDevice(self.device):
-            wp.utils.radix_sort_pairs(self._sorted_color, self._sorted_pair, room, end_bit=7)
+        radix_sort(self._sorted_color, self._sorted_pair, room, 7)
         self._launch(graph_coloring.find_color_kernel, room + 1, [self._sorted_color, self._color_start])
 
     def _relax(self, each, stage):

@@ -46,6 +46,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import flag, whole_number
+from warp_abtree.checks.radix_sort import radix_sort
 from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.contacts import column, contact, loops, manifold, near_points
 from warp_abtree.kernels.contacts import points as point_kernels
@@ -185,8 +186,7 @@ class PointStage(Stage):
             operator.launch_warps(inside_points.add_inside_point_kernel, operator.rooms.pairs, inputs)
 
     def _sort_keys(self, count, bits):
-        with wp.ScopedDevice(self.operator.device):
-            wp.utils.radix_sort_pairs(self._contacts.key, self._contacts.order, count, end_bit=bits)
+        radix_sort(self._contacts.key, self._contacts.order, count, bits)
 
     def read(self, found: Found, device: bool, with_rows: bool):
         """Read the points."""

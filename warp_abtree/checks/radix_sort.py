@@ -1,0 +1,31 @@
+"""Radix sort of numbers on a device, with the errors that Warp's reports nowhere but in its log."""
+
+import ctypes
+from typing import Any
+
+import warp as wp
+
+
+def radix_sort(keys: wp.array, values: wp.array, count: int, bits: int):
+    """Sort the first numbers of an array by so many low bits, and values with them, in place. Launches only.
+
+    Args:
+        keys, values: (2 count,) or more; what lies behind the first count is scratch.
+
+    Raises:
+        RuntimeError: Warp did not sort them, twice: it has seen no device while many processes started on one.
+    """
+    for _ in range(2):
+        ctypes.memset(_error_address(), 0, 1)
+        with wp.ScopedDevice(keys.device):
+            wp.utils.radix_sort_pairs(keys, values, count, end_bit=bits)
+        error = ctypes.string_at(_error_address()).decode(errors="replace")
+        if not error:
+            return
+    raise RuntimeError(f"{count} numbers on {keys.device} were not sorted: {error}")
+
+
+def _error_address() -> int:
+    """Return where Warp's library keeps its last error, a string that no later success clears."""
+    core: Any = wp._src.context.runtime.core
+    return ctypes.CFUNCTYPE(ctypes.c_void_p)(("wp_get_error_string", core))()
