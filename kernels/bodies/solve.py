@@ -34,7 +34,10 @@ SOFTNESS = wp.constant(wp.float64(1.0 / (1.0 + _FREQUENCY * _RESPONSE)))
 """Part of the impulse that it gives up."""
 
 VISITS_LEAST, VISITS_MAX = wp.constant(3), wp.constant(64)
-"""How often a pass relaxes the points of a pair before the next pair: once more for each doubling of a fast impact."""
+"""How often a pass relaxes the points of a pair before the next pair: once more for each doubling of a hard impact."""
+
+HARD = wp.constant(wp.float64(2.0**-3))
+"""Part of the speed of an impact that, if fast, makes it hard."""
 
 
 @wp.struct
@@ -227,7 +230,7 @@ def relax_pair(
     fastest = warp_max(fastest)
     struck = wp.where(stage == RELAX, constraints.is_struck[p], 0)
     struck = wp.where(fastest > relaxation.fast, 1, struck)
-    visits, rest_speed = wp.int32(VISITS_LEAST), wp.float64(fastest)
+    visits, rest_speed = wp.int32(VISITS_LEAST), HARD * fastest
     while rest_speed > relaxation.fast and visits < VISITS_MAX:
         visits += 1
         rest_speed *= HALF
