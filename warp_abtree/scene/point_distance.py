@@ -22,7 +22,7 @@ from warp_abtree.scene.objects import check_models
 from warp_abtree.scene.posed_objects import PosedObjects
 
 # Points of a thread: the next starts from the last one's nearest face.
-RUNS = {"cpu": 256, "cuda": 8}
+RUNS = {"cpu": 256, "cuda": 1}
 # Models whose device arrays are kept for the next call.
 KEPT_MODELS = 4
 OUTPUTS = {"distance": wp.float64, "object": wp.int32, "nearest": wp.vec3d, "face": wp.int32}
