@@ -1,6 +1,5 @@
 """Recording of a scene that runs, as one page of HTML that plays it in a browser without a server."""
 
-import math
 from dataclasses import replace
 from html import escape
 
@@ -79,7 +78,9 @@ class SceneRecording:
         if row.frame % self.stride:
             return
         scene = self.loaded.scene
-        snapshot = Snapshot(row.frame, row.time, scene.poses, scene.lods, scene.intersect(output=self.settings.output), row)
+        snapshot = Snapshot(
+            row.frame, row.time, scene.poses, scene.lods, scene.intersect(output=self.settings.output), row
+        )
         data = compose(self.cache, snapshot, self.shown, self.settings)
         place = {"poses": rounded(data.poses), "contacts": None if data.contacts is None else rounded(data.contacts)}
         data = replace(data, intersecting={k: rounded(v) for k, v in data.intersecting.items()}, **place)
@@ -90,7 +91,7 @@ class SceneRecording:
             self.time += self.seconds
         self._scene.show(data)
         self._tell(data, row)
-        self.pictures.append(replace(data, poses=None))
+        self.pictures.append(replace(data, poses=data.poses[:0], intersecting=dict.fromkeys(data.intersecting)))
 
     def _begin(self, ball):
         """Place the cameras: of the page, and the frustum of the one that LODs are for."""
