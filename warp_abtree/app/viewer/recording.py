@@ -19,7 +19,7 @@ from warp_abtree.app.viewer.viewer_scene import ViewerScene, light_scene, place_
 from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.checks.quaternions import quaternions_of
 
-PICTURES = 80  # of a recording, at most
+PICTURES_MAX = 80  # of a recording, at most
 PICTURE_SECONDS = 1 / 15  # that a picture is shown, at least; faster scenes are slowed down
 KEPT_BITS = 10  # of the mantissa of positions and vertices: 0.05 % of a coordinate
 CAMERA_SCALE = 0.06  # of the frustum of the scene's camera, in radii of what is shown
@@ -33,7 +33,7 @@ footer { padding: 0.5em 0.7em 0; line-height: 1.5 }
 </style>"""
 
 
-def rounded(values) -> np.ndarray:
+def short_floats(values) -> np.ndarray:
     """Return float32 of fewer bits, which pack better."""
     bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
     dropped = 23 - KEPT_BITS
@@ -45,7 +45,7 @@ class _RoundedMeshes(geometry.MeshCache):
 
     def mesh(self, model, lod):
         vertices, faces, face_ids = super().mesh(model, lod)
-        return rounded(vertices), faces, face_ids
+        return short_floats(vertices), faces, face_ids
 
 
 class SceneRecording:
@@ -65,7 +65,7 @@ class SceneRecording:
         self._eye, self._up = unit(view.eye), unit(view.up)
         self.shown = objects_to_draw(loaded.worlds, view.world, f"{loaded.path}: picture.")
         self.settings = Settings(by_lod=by_lod, intersecting=not by_lod, contacts=loaded.dynamics is not None)
-        self.stride = -(-frames // PICTURES)
+        self.stride = -(-frames // PICTURES_MAX)
         self.seconds = max(self.stride * loaded.time_step, PICTURE_SECONDS)
         self.time, self.pictures = 0.0, []
         self.cache = _RoundedMeshes(loaded.scene)
@@ -82,8 +82,11 @@ class SceneRecording:
             row.frame, row.time, scene.poses, scene.lods, scene.intersect(output=self.settings.output), row
         )
         data = compose(self.cache, snapshot, self.shown, self.settings)
-        place = {"poses": rounded(data.poses), "contacts": None if data.contacts is None else rounded(data.contacts)}
-        data = replace(data, intersecting={k: rounded(v) for k, v in data.intersecting.items()}, **place)
+        place = {
+            "poses": short_floats(data.poses),
+            "contacts": None if data.contacts is None else short_floats(data.contacts),
+        }
+        data = replace(data, intersecting={k: short_floats(v) for k, v in data.intersecting.items()}, **place)
         if not self.pictures:
             self._begin(geometry.bounds(self.cache, snapshot, self.shown))
         else:
