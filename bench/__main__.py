@@ -24,10 +24,14 @@ import warp_abtree as ab
 from . import tables
 
 NAMES = "assembly baselines broad budget build coarse distance exact frame gate host motion points query robot scale"
-CASES = (*NAMES.split(), "sweep", "update")
+CASES = (*NAMES.split(), "libraries", "sweep", "update")
 STUDIES = {"paper": "study", "tradeoff": "study", "nightly": "nightly"}  # and the modules that run them
 MODULES = {name: f"bench.cases.{name}" for name in CASES} | {"motion": "bench.motions.case"}
-MODULES |= {"broad": "bench.baselines.box_tree", "points": "bench.contacts.points"}
+MODULES |= {
+    "broad": "bench.baselines.box_tree",
+    "libraries": "bench.baselines.libraries",
+    "points": "bench.contacts.points",
+}
 MODULES |= {"robot": "bench.motions.robot", "gate": "bench.gate.compare"}
 MODULES |= {name: f"bench.studies.{module}" for name, module in STUDIES.items()}
 FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml
