@@ -117,7 +117,9 @@ class MeshContacts:
                     start, first = host.mesh_vertadr[i], host.mesh_faceadr[i]
                     vertices = host.mesh_vert[start : start + host.mesh_vertnum[i]]
                     meshes[i] = ab.Model.from_arrays(vertices, host.mesh_face[first : first + host.mesh_facenum[i]])
-                self.scene.add(meshes[i], world=world, static=bool(body == 0))
+                # Of solids, what has gone under whole keeps its depth.
+                solid = meshes[i].winding.is_closed
+                self.scene.add(meshes[i], world=world, static=bool(body == 0), solid=solid)
         together = np.argwhere(np.triu(weld[:, None] == weld, 1))  # of one body, or of what stands
         for world in range(data.nworld):
             self.scene.filter(together + world * len(geoms))
