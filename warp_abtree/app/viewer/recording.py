@@ -23,11 +23,12 @@ PICTURES_MAX = 80  # of a recording, at most
 PICTURE_SECONDS = 1 / 15  # that a picture is shown, at least; faster scenes are slowed down
 KEPT_BITS = 10  # of the mantissa of positions and vertices: 0.05 % of a coordinate
 CAMERA_SCALE = 0.06  # of the frustum of the scene's camera, in radii of what is shown
+# viser's player loads the light of the surroundings anew, and fades in, whenever it begins again: the canvas stays opaque.
 # Below the recording stand a title and a legend; in a window that is higher than wide the recording is a square.
 STYLE = """<style>
 html, body { height: 100% } body { margin: 0; display: flex; flex-direction: column; font-family: sans-serif }
 #root { flex: 1; min-height: 0; position: relative; overflow: hidden; contain: strict }
-#root > div { height: 100% !important }
+#root > div { height: 100% !important } canvas { opacity: 1 !important }
 footer { padding: 0.5em 0.7em 0; line-height: 1.5 }
 @media (max-aspect-ratio: 1/1) { #root { flex: none; height: 110vw } }
 </style>"""
