@@ -123,9 +123,9 @@ def test_a_page_plays_in_a_browser_without_a_server(tmp_path, capsys, width, hei
         tab.on("pageerror", lambda error: faults.append(str(error)))
         tab.goto(page.as_uri())
         end = monotonic() + 120
-        while (drawn := count_coloured(tab)) < 100 and monotonic() < end:
+        while (drawn := count_coloured(tab)) < 500 and monotonic() < end:
             tab.wait_for_timeout(300)
-        assert drawn >= 100
+        assert drawn >= 500
         box, bar = tab.locator("footer").bounding_box(), tab.locator("input").first.bounding_box()
         assert box["y"] + box["height"] <= height and box["width"] <= width and bar["y"] < box["y"]
         assert tab.evaluate("document.documentElement.scrollWidth") == width

@@ -132,8 +132,8 @@ def contact_points(cache: MeshCache, shown) -> np.ndarray:
     query = ManifoldQuery(cache.scene, gap=CONTACT_GAP * min(cache.diagonals))
     query.grow()
     found = query.result()
-    kept = np.isin(found.pairs, shown).all(axis=1)
-    return found.points["point"][kept[found.points["pair"]]]
+    of_shown = np.isin(found.pairs, shown)[found.points["pair"]]
+    return found.points["point"][of_shown.all(axis=1)]
 
 
 # Corners of a box, as bits for x, y and z, at the ends of its edges.

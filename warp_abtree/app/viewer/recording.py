@@ -23,7 +23,7 @@ PICTURES_MAX = 80  # of a recording, at most
 PICTURE_SECONDS = 1 / 15  # that a picture is shown, at least; faster scenes are slowed down
 KEPT_BITS = 10  # of the mantissa of positions and vertices: 0.05 % of a coordinate
 CAMERA_SCALE = 0.06  # of the frustum of the scene's camera, in radii of what is shown
-# viser's player loads the light of the surroundings anew, and fades in, whenever it begins again: the canvas stays opaque.
+# The player loads the light of the surroundings, and fades in, whenever it begins again: the canvas stays opaque.
 # Below the recording stand a title and a legend; in a window that is higher than wide the recording is a square.
 STYLE = """<style>
 html, body { height: 100% } body { margin: 0; display: flex; flex-direction: column; font-family: sans-serif }
@@ -83,11 +83,9 @@ class SceneRecording:
             row.frame, row.time, scene.poses, scene.lods, scene.intersect(output=self.settings.output), row
         )
         data = compose(self.cache, snapshot, self.shown, self.settings)
-        place = {
-            "poses": short_floats(data.poses),
-            "contacts": None if data.contacts is None else short_floats(data.contacts),
-        }
-        data = replace(data, intersecting={k: short_floats(v) for k, v in data.intersecting.items()}, **place)
+        contacts = None if data.contacts is None else short_floats(data.contacts)
+        triangles = {model: short_floats(corners) for model, corners in data.intersecting.items()}
+        data = replace(data, poses=short_floats(data.poses), intersecting=triangles, contacts=contacts)
         if not self.pictures:
             self._begin(geometry.bounds(self.cache, snapshot, self.shown))
         else:
