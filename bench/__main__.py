@@ -24,11 +24,15 @@ import warp_abtree as ab
 from . import tables
 
 NAMES = "assembly baselines broad budget build coarse distance exact frame gate gradients host motion points query"
-CASES = (*NAMES.split(), "robot", "scale", "sweep", "update")
+CASES = (*NAMES.split(), "libraries", "robot", "scale", "sweep", "update")
 STUDIES = {"paper": "study", "tradeoff": "study", "nightly": "nightly"}  # and the modules that run them
 MODULES = {name: f"bench.cases.{name}" for name in CASES} | {"motion": "bench.motions.case"}
-MODULES |= {"broad": "bench.baselines.box_tree", "points": "bench.contacts.points"}
-MODULES |= {"gradients": "bench.contacts.gradients"}
+MODULES |= {
+    "broad": "bench.baselines.box_tree",
+    "gradients": "bench.contacts.gradients",
+    "libraries": "bench.baselines.libraries",
+    "points": "bench.contacts.points",
+}
 MODULES |= {"robot": "bench.motions.robot", "gate": "bench.gate.compare"}
 MODULES |= {name: f"bench.studies.{module}" for name, module in STUDIES.items()}
 FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml

@@ -89,12 +89,12 @@ def to_host(query):
     return lambda: (query.launch(), query.result())[1]
 
 
-def time_on_host(calls: dict, device, repeats) -> dict:
-    """Return the sorted times [ms] of calls that return their answers, in turn.
+def time_on_host(calls: dict, device, repeats, clock=None) -> dict:
+    """Return the sorted times [ms] of calls that return their answers, in turn, by a clock [s].
 
-    On the CPU the time that the thread ran, whatever else the machine does; a GPU works while the thread waits.
+    None is on the CPU the time that the thread ran, whatever else the machine does; a GPU works while the thread waits.
     """
-    clock = time.thread_time if device.is_cpu else time.perf_counter
+    clock = clock or (time.thread_time if device.is_cpu else time.perf_counter)
     with no_garbage_collection():
         return time_in_turn(calls, wp.get_device("cpu"), repeats, clock)
 

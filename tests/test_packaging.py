@@ -4,14 +4,17 @@ import email
 import json
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+from helpers import refused
 
 import warp_abtree as ab
 from warp_abtree import app, jobs
@@ -20,6 +23,8 @@ from warp_abtree.app.toml.folder import find_scene, scene_folder, scene_names
 
 ROOT = Path(__file__).resolve().parents[1]
 LEAST_SETUPTOOLS = 77  # for the licence as pyproject.toml writes it
+
+not_shipped = pytest.mark.skipif(not (ROOT / "release").is_dir(), reason="release/ is in a checkout alone")
 
 
 @pytest.fixture(scope="session")
@@ -128,6 +133,36 @@ def test_scenes_are_found_by_name(tmp_path, monkeypatch):
     with pytest.raises(SceneError, match=r"gone\.toml: No such file.*scenes that come.*bunny_tori, "):
         load_scene("gone.toml", device="cpu")
     assert load_scene("needle", device="cpu").path == ROOT / "scenes" / "needle.toml"
+
+
+@not_shipped
+def test_release_notes_are_the_section_of_a_version():
+    notes_of = runpy.run_path(str(ROOT / "release" / "release_notes.py"))["notes_of"]
+    text = (
+        "# Changelog\n\n## Unreleased\n\n## 1.2.0 - 2026-11\n\n### Added\n\n- one\n  line\n- two\n\n## [1.1.0]\n\nold\n"
+    )
+    assert notes_of("1.2.0", text) == "### Added\n\n- one line\n- two\n"
+    assert notes_of("1.1.0", text) == "old\n"
+    for version in ("1.2", "Unreleased", "2.0.0"):
+        refused(ValueError, rf"nothing about {re.escape(version)}; it has 1\.2\.0, 1\.1\.0", notes_of, version, text)
+    changes = notes_of(ab.__version__, (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"))
+    assert "### Added" in changes and "\n## " not in changes
+
+
+@not_shipped
+def test_versions_of_other_files_agree():
+    version = ab.__version__
+    for name, text in (
+        ("CITATION.cff", f"version: {version}\n"),
+        ("release/recipe.yaml", f'version: "{version}"'),
+        ("README.md", f"warp_abtree-{version}-py3-none-any.whl"),
+        ("docs/index.md", f"warp_abtree-{version}-py3-none-any.whl"),
+    ):
+        assert text in (ROOT / name).read_text(encoding="utf-8"), name
+    recipe = (ROOT / "release" / "recipe.yaml").read_text(encoding="utf-8").split("run:\n")[1].split("tests:")[0]
+    needed = {line.strip("- ").replace(" ", "") for line in recipe.splitlines() if line.strip().startswith("-")}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert needed - {"python>=${{python_min}}"} == set(project["dependencies"])
 
 
 @pytest.mark.parametrize("module", [ab, jobs, app], ids=lambda module: module.__name__)

@@ -2,7 +2,6 @@
 
 import io
 import re
-import shutil
 import socket
 import threading
 import time
@@ -12,7 +11,7 @@ import numpy as np
 import PIL.Image
 import pytest
 from helpers import refused
-from helpers.viewer import make_models, make_playback, run_command, write_scene
+from helpers.viewer import CHROMIUM, FLAGS, make_models, make_playback, run_command, write_scene
 from oracles.motion import posed
 
 import warp_abtree as ab
@@ -28,9 +27,6 @@ from warp_abtree.app.viewer.command import serve
 from warp_abtree.app.viewer.guard import is_refused, refuse_foreign
 from warp_abtree.app.viewer.object_panel import LISTED_OBJECTS
 from warp_abtree.app.viewer.page import Page
-
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 
 
 @pytest.fixture

@@ -104,6 +104,14 @@ def check_baselines(rows):
         assert row["meet"] == 3 and row["ours_any_per_s"] > 0 and row["faces_ratio"] > 0
 
 
+def check_libraries(rows):
+    assert [row["library"] for row in rows] == "warp_abtree python-fcl coal MeshLib trueform py-parry3d".split()
+    for row in rows:
+        if "skipped" not in row:
+            assert row["any_us"] > 0 and row["hits"] > 0 == row.get("any_differ", 0) == row.get("faces_missed", 0)
+            assert row.get("distance_error", 0) < 1e-6 and ("faces_us" in row) == (row["library"] != "py-parry3d")
+
+
 def check_distance(rows):
     gaps, points = ([row for row in rows if name in row] for name in ("gap", "points"))
     rows = [row for row in rows if "gap" not in row and "points" not in row]

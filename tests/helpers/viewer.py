@@ -1,5 +1,6 @@
 """Models, scene files and playbacks that tests of applications use, and a runner of commands."""
 
+import shutil
 from functools import cache
 from pathlib import Path
 
@@ -10,6 +11,9 @@ from helpers.samples import SHUTTLE_SCENE
 from warp_abtree.app.cli.main import main
 from warp_abtree.app.playback import MeshPlayback
 
+# A browser without a window, and its flags to draw without a GPU.
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 SCENE = (
     SHUTTLE_SCENE
     + """

@@ -1,17 +1,19 @@
 """Render data of a scene at one time: `compose` makes `RenderData` of a `Snapshot`, for viewer and pictures."""
 
 from dataclasses import dataclass
+from html import escape
 
 import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.cli.report import show_number
-from warp_abtree.app.styles import COLOURS
+from warp_abtree.app.styles import COLOURS, to_bytes
 from warp_abtree.query.result import Result
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame_row import FrameRow
 
 NOWHERE = -2  # world of a place without an object
+LEGEND = 24  # entries of one in HTML
 LABELS = 32  # distances that are told in numbers, at most
 
 
@@ -35,6 +37,7 @@ class Settings:
     intersecting: bool = True  # whether intersecting faces are coloured
     by_lod: bool = False  # whether colours tell LODs in the place of models
     distances: bool = False  # whether distances are drawn between objects that do not meet
+    contacts: bool = False  # whether contact points are drawn, objects see-through
     wireframe: bool = False  # whether edges are drawn in the place of faces
     selected: int | None = None  # object of whose AB-Tree boxes are drawn,
     tree_level: int = 0  # those of the active nodes at a level; 0 is the root
@@ -60,6 +63,7 @@ class RenderData:
     error_mean: float  # mean certified error of the shown objects [units]; NaN where that takes long
     nearest: np.ndarray  # nearest points of object pairs that are apart, float64 (k, 2, 3)
     distance: np.ndarray  # between them, float64 (k,)
+    contacts: np.ndarray | None  # contact points, which objects are see-through for, float64 (k, 3)
     boxes: np.ndarray  # edges of the boxes of the selected object's AB-Tree, float64 (k, 2, 3)
     wireframe: bool  # whether edges are drawn in the place of faces
 
@@ -122,6 +126,7 @@ def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Sett
         error_mean=sum(error_of(scene.models[model], lod) * n for model, lod, n in meshes) / max(len(shown), 1),
         nearest=nearest,
         distance=distance,
+        contacts=geometry.contact_points(cache, shown) if settings.contacts else None,
         boxes=geometry.NO_SEGMENTS[0] if chosen is None else geometry.tree_boxes(scene, snapshot, chosen, level),
         wireframe=settings.wireframe,
     )
@@ -141,3 +146,11 @@ def make_legend(scene: Scene, panels: list[RenderData], by_lod=False) -> list:
         if any(model in data.intersecting for data in panels):
             legend.append((bright, f"{name}, intersecting"))
     return legend
+
+
+def legend_html(entries) -> str:
+    """Return a legend of `make_legend` in HTML."""
+    entry = "<span style='white-space:nowrap;margin-right:1em'><span style='color:rgb{}'>&#9632;</span> {}</span> "
+    lines = [entry.format(to_bytes(colour), escape(label)) for colour, label in entries[:LEGEND]]
+    more = f"and {len(entries) - LEGEND:,} more" if len(entries) > LEGEND else ""
+    return f"<div style='margin:0 1em 0.5em;font-size:0.85em'>{''.join(lines)}{more}</div>"

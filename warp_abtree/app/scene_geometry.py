@@ -8,11 +8,13 @@ import numpy as np
 from warp_abtree.app.cli.model_commands import diagonal_of
 from warp_abtree.app.styles import COLOURS
 from warp_abtree.checks.quaternions import matrices_of
+from warp_abtree.query.stages.points import ManifoldQuery
 from warp_abtree.scene.scene import Scene
 
 LIFT = 1.5e-3  # of a model's diagonal: offset of intersecting faces from the mesh, to both sides
 COARSE, FINE = np.array((0.16, 0.24, 0.60)), np.array((0.94, 0.90, 0.84))  # LODs; far from all intersecting faces
 FEW_OBJECTS = 12  # all pairs of which have distances drawn
+CONTACT_GAP = 2.0**-9  # of the smallest model's diagonal: contact points of faces nearer than that
 NO_SEGMENTS = np.empty((0, 2, 3)), np.empty(0)
 CERTIFIED_FACES = 300_000  # of models whose errors are certified to be told, which takes seconds
 CACHED_FACES = 4_000_000  # that a cache of meshes keeps
@@ -123,6 +125,15 @@ def nearest_points(scene: Scene, shown, result) -> tuple[np.ndarray, np.ndarray]
     found = scene.intersect(pairs, output="distance")
     apart = found.distance > 0
     return found.points[apart], found.distance[apart]
+
+
+def contact_points(cache: MeshCache, shown) -> np.ndarray:
+    """Return the contact points of pairs of shown objects, float64 (k, 3). Waits for the device."""
+    query = ManifoldQuery(cache.scene, gap=CONTACT_GAP * min(cache.diagonals))
+    query.grow()
+    found = query.result()
+    of_shown = np.isin(found.pairs, shown)[found.points["pair"]]
+    return found.points["point"][of_shown.all(axis=1)]
 
 
 # Corners of a box, as bits for x, y and z, at the ends of its edges.

@@ -9,6 +9,8 @@ COLOURS = (
 )
 # Segments between the nearest points of two objects.
 NEAREST_COLOUR = (0.85, 0.10, 0.10)
+# Contact points, and how opaque the objects are behind which they lie.
+CONTACT_COLOUR, SEE_THROUGH = (0.90, 0.05, 0.20), 0.3
 # Boxes of an AB-Tree.
 BOX_COLOUR = (0.05, 0.05, 0.05)
 # The stages of a frame; a budget is for the first four.

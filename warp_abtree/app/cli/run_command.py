@@ -1,5 +1,6 @@
 """`warp-abtree run`: a scene frame by frame."""
 
+import contextlib
 import gc
 import importlib.util
 import os
@@ -16,6 +17,8 @@ from warp_abtree.app.pictures.scenes import draw_scene
 from warp_abtree.app.toml.control import CONTROLLERS
 from warp_abtree.app.toml.folder import scene_names
 from warp_abtree.app.toml.scene_file import load_scene
+from warp_abtree.app.viewer.command import import_viser, serve
+from warp_abtree.app.viewer.recording import SceneRecording
 
 SUMMARY = "run a scene frame by frame and time its stages"
 EXAMPLES = (
@@ -23,7 +26,7 @@ EXAMPLES = (
     "scenes/herd.toml --frames 10 --device cpu --record herd.csv",
     "rain --budget 8ms --controller paper --plot plots",
 )
-PLOT_NAME = "frames.png"
+PLOT_NAME, PAGE = "frames.png", ".html"
 PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg", ".webp", ".gif")
 
 
@@ -38,7 +41,7 @@ def add_arguments(sub: Parser):
     )
     sub.add_argument("--budget", type=milliseconds, metavar="TIME", help="time of a frame to hold, as 8ms or 0.008s")
     sub.add_argument("--controller", choices=CONTROLLERS, help="what chooses LODs (the scene's own, or predictive)")
-    about = "write a row a frame as it ends, .csv or .json"
+    about = "write a row a frame as it ends, .csv or .json, or a page that plays the frames, .html"
     sub.add_file("--record", type=Path, metavar="FILE", help=about)
     sub.add_file("--plot", type=Path, metavar="DIR", help="draw LODs, times and error over the frames there")
 
@@ -55,16 +58,24 @@ def run(options, progress):
     controller = loaded.control.asked(options.controller, options.budget).controller
     frame = loaded.frame(controller=options.controller, budget_ms=options.budget, bodies=bodies)
     lods = []
-    if options.record:
-        frame.record(options.record)
+    with contextlib.ExitStack() as stack:
+        page = None
+        if options.record and options.record.suffix.lower() == PAGE:
+            page = SceneRecording(stack.enter_context(serve()), loaded, frames, controller != "none")
+        elif options.record:
+            frame.record(options.record)
 
-    def after_frame(done, total):
-        if options.plot:
-            lods.append(loaded.scene.lods)
-        progress("frames", done, total)
+        def after_frame(done, total):
+            if options.plot:
+                lods.append(loaded.scene.lods)
+            if page is not None:
+                page.add(frame.history[-1])
+            progress("frames", done, total)
 
-    frame.run(frames, after_frame)
-    progress.close()
+        frame.run(frames, after_frame)
+        progress.close()
+        if page is not None:
+            page.write(options.record)
     written = [str(path) for path in _write(options, loaded, frame, (controller, lods))]
     summary = {
         "title": loaded.title,
@@ -90,7 +101,9 @@ def run(options, progress):
 def _check(options):
     """Refuse options that cannot be met, before any work."""
     if options.record:
-        check_output(options.record, [".csv", ".json"], inputs=[options.scene])
+        check_output(options.record, [".csv", ".json", PAGE], inputs=[options.scene])
+        if options.record.suffix.lower() == PAGE:
+            import_viser("--record of a page")
     if options.picture:
         check_output(options.picture, [".png"])
         import_pyvista("--picture")

@@ -30,12 +30,12 @@ def add_arguments(sub: Parser):
     sub.add_argument("--port", type=int, metavar="P", help=f"port to serve at ({PORT}, or the next one that is free)")
 
 
-def import_viser():
-    """Return viser, silent; raise ValueError where it is not installed."""
+def import_viser(asked="view"):
+    """Return viser, silent; raise ValueError where it is not installed, with what was asked."""
     try:
         import viser
     except ImportError as error:
-        raise ValueError(f"view needs viser: pip install viser ({error})") from None
+        raise ValueError(f"{asked} needs viser: pip install viser ({error})") from None
     # A browser that goes away in the middle of a message is no news.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     return viser

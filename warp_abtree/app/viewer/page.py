@@ -7,30 +7,26 @@ import math
 import queue
 import time
 from dataclasses import replace
-from html import escape
 
 import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.cli.report import show_number
 from warp_abtree.app.playback import HOLD_MODE, OWN_MODE
-from warp_abtree.app.render_data import Settings, compose, make_legend, objects_of_world
-from warp_abtree.app.styles import STAGE_LABELS, to_bytes
+from warp_abtree.app.render_data import Settings, compose, legend_html, make_legend, objects_of_world
+from warp_abtree.app.styles import STAGE_LABELS
 from warp_abtree.app.toml.objects import unit
 from warp_abtree.app.viewer.object_panel import ObjectPanel
-from warp_abtree.app.viewer.viewer_scene import ViewerScene
+from warp_abtree.app.viewer.viewer_scene import ViewerScene, light_scene, place_camera
 from warp_abtree.checks.quaternions import quaternions_of
 from warp_abtree.lod.view import Camera
 
 FRAME_SECONDS = 1 / 30  # between snapshots that are sent, at least
 TEXT_SECONDS = 0.2  # between changes of numbers while it plays
 BUDGETS = (0.5, 100.0)  # of the slider [ms]
-LIGHT = 0.6
-CAMERA_DISTANCE = 1.8  # of the first camera, in radii of what is shown
 FACE_BUDGET = 2_000_000  # faces that are shown to begin with, at most
 KEPT_BYTES = 2**28  # of the frames that the slider goes back to
 TREE_LEVELS = 10  # of an AB-Tree whose boxes are drawn
-LEGEND = 24  # entries
 MODE_LABELS = {
     OWN_MODE: "as the scene says",
     HOLD_MODE: "hold as they are",
@@ -66,11 +62,10 @@ class Page:
         self._steps, self._dirty = 0, True
         self._kept, self._past = [], None  # snapshots of frames, and the one of them that is shown
         self._text_time = self._snapshot_time = -math.inf
-        server.scene.set_up_direction(tuple(self._up))
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         server.gui.main_panel.dock_right()
         server.gui.set_panel_label(playback.title)
-        self._light()
+        light_scene(server.scene, self._eye, self._up)
         self._build(self._open_coarser())
         self.snapshot = playback.query(self.settings.output)
         self._keep()
@@ -134,6 +129,7 @@ class Page:
         box("intersecting faces", "intersecting", disabled=alone)
         box("colours by LOD", "by_lod", disabled=fixed)
         box("distances", "distances", "of few objects all, of many those whose boxes overlap", disabled=alone)
+        box("contact points", "contacts", hint="objects see-through", disabled=alone)
         box("wireframe", "wireframe")
         axes, grid = gui.add_checkbox("axes", False), gui.add_checkbox("grid", False)
         self._on_change(axes, lambda value: setattr(self.server.scene.world_axes, "visible", value))
@@ -186,22 +182,10 @@ class Page:
         self.playback.hold([round(percent / 100 * scene.models[model].lod_max) for model in scene.object_model])
         self._mode.value, self._past = MODE_LABELS[HOLD_MODE], None
 
-    # Light, camera and grid.
-
-    def _light(self):
-        """Put a soft light in the place of viser's own, which bleach colours beside its environment."""
-        scene = self.server.scene
-        scene.configure_default_lights(False)
-        direction = self._up - np.cross(self._up, self._eye) + 0.6 * self._eye
-        scene.add_light_directional("/light", position=tuple(direction), intensity=LIGHT, cast_shadow=False)
-
     def _place_camera(self):
-        """Put the first camera where it sees all that is shown."""
-        first = self.server.initial_camera
-        centre, radius = geometry.bounds(self.cache, self.snapshot, self.shown)
-        position = centre + CAMERA_DISTANCE * radius * self._eye
-        first.position, first.look_at, first.up = tuple(position), tuple(centre), tuple(self._up)
-        first.near, first.far = radius / 500, 200 * radius
+        """Put the first camera where it sees all that is shown, and a grid below."""
+        centre, radius = ball = geometry.bounds(self.cache, self.snapshot, self.shown)
+        position = place_camera(self.server.initial_camera, ball, self._eye, self._up)
 
         @self.server.on_client_connect
         def _(client):  # a window that is higher than wide sees less
@@ -271,7 +255,7 @@ class Page:
         self._steps, self._dirty = max(self._steps - 1, 0), False
         settings = replace(self.settings, selected=self.objects.selected)
         if self._past is not None:  # the scene has moved on, and answers for now
-            settings = replace(settings, selected=None, distances=False)
+            settings = replace(settings, selected=None, distances=False, contacts=False)
         self._data = compose(self.cache, self.snapshot, self.shown, settings)
         self._send()
         self.snapshots += 1
@@ -328,8 +312,4 @@ class Page:
         self._budget.disabled = playback.mode not in BUDGET_MODES
         self._level.disabled = self.objects.selected is None
         self.objects.tell(self.snapshot)
-        entries = make_legend(playback.scene, [self._data], self.settings.by_lod)
-        entry = "<span style='white-space:nowrap;margin-right:1em'><span style='color:rgb{}'>&#9632;</span> {}</span> "
-        lines = [entry.format(to_bytes(colour), escape(label)) for colour, label in entries[:LEGEND]]
-        more = f"and {len(entries) - LEGEND:,} more" if len(entries) > LEGEND else ""
-        self._legend.content = f"<div style='margin:0 1em 0.5em;font-size:0.85em'>{''.join(lines)}{more}</div>"
+        self._legend.content = legend_html(make_legend(playback.scene, [self._data], self.settings.by_lod))

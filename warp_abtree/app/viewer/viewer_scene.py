@@ -8,11 +8,14 @@ import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.render_data import RenderData
-from warp_abtree.app.styles import BOX_COLOUR, COLOURS, NEAREST_COLOUR, to_bytes
+from warp_abtree.app.styles import BOX_COLOUR, COLOURS, CONTACT_COLOUR, NEAREST_COLOUR, SEE_THROUGH, to_bytes
 
 SINGLE_LIMIT = 24  # objects up to which each has its own mesh; with more, those of a model and LOD are instances of one
 READY_SECONDS = 0.25  # that a browser takes to draw instances of a new mesh
 LINE = {"thickness": 2.5, "thickness_units": "screen"}
+POINT_SIZE = 1 / 60  # of contact points, of the diagonal of the smallest model
+CAMERA_DISTANCE = 1.8  # of the first camera, in radii of what is shown
+LIGHT = 0.6
 HIDDEN_MESHES = 48  # kept by the browser, invisible, for when their LOD comes back
 PLAIN = {"flat_shading": True, "side": "double", "cast_shadow": False, "receive_shadow": False}
 
@@ -60,6 +63,7 @@ class ViewerScene:
             self._show_triangles(f"/intersecting/{owner}", corners, COLOURS[owner % len(COLOURS)][1])
         self._show_segments("/distances", data.nearest, NEAREST_COLOUR)
         self._show_segments("/boxes", data.boxes, BOX_COLOUR)
+        self._show_points("/contacts", () if data.contacts is None else data.contacts)
         self._show_labels(data)
 
     def _update(self, node: _Node, **arrays):
@@ -92,12 +96,12 @@ class ViewerScene:
         for i in set(self._single) - set(objects.tolist()):
             self._set(self._single[i], "visible", False)
         for i in objects.tolist():
-            pose, colour, key = data.poses[i], tuple(data.colours[i].tolist()), int(data.keys[i])
+            pose, key = data.poses[i], int(data.keys[i])
+            look = {"color": tuple(data.colours[i].tolist()), **_material(data)}
             place = {"position": pose[:3].copy(), "wxyz": pose[[6, 3, 4, 5]]}
             node = self._single.get(i)
             if node is None:
                 arrays = {**self._mesh_arrays(key), **place}
-                look = {"color": colour, "wireframe": data.wireframe}
                 handle = self.api.add_mesh_simple(f"/objects/{i}", **arrays, **look, **PLAIN)
                 handle.on_click(lambda _, i=i: self.pick(i))
                 self._single[i] = self._added(handle, arrays, key=key, **look)
@@ -105,8 +109,8 @@ class ViewerScene:
             if node.sent["key"] != key:
                 self._update(node, **self._mesh_arrays(key))
                 node.sent["key"] = key
-            self._set(node, "color", colour)
-            self._set(node, "wireframe", data.wireframe)
+            for name, value in look.items():
+                self._set(node, name, value)
             self._update(node, **place)
             self._set(node, "visible", True)
 
@@ -128,9 +132,10 @@ class ViewerScene:
             }
             node = self._meshes.pop(key, None)
             if node is None:
-                node = self._add_instances(key, arrays, visible=key in groups, wireframe=data.wireframe)
+                node = self._add_instances(key, arrays, visible=key in groups, **_material(data))
             elif key in groups:
-                self._set(node, "wireframe", data.wireframe)
+                for name, value in _material(data).items():
+                    self._set(node, name, value)
                 self._update(node, **arrays)
                 self._set(node, "visible", True)
             node.members = members
@@ -181,6 +186,17 @@ class ViewerScene:
             self._update(node, **arrays)
             self._set(node, "visible", bool(arrays))
 
+    def _show_points(self, name, points):
+        """Show points (k, 3) as a node of their own; without any hide it."""
+        node, arrays = self._layers.get(name), {"points": np.asarray(points, np.float32)} if len(points) else {}
+        if node is None and arrays:
+            look = {"colors": to_bytes(CONTACT_COLOUR), "point_size": POINT_SIZE * min(self.cache.diagonals)}
+            shape = {"point_shape": "circle", "point_shading": "flat", "precision": "float32"}
+            self._layers[name] = self._added(self.api.add_point_cloud(name, **arrays, **look, **shape), arrays)
+        elif node is not None:
+            self._update(node, **arrays)
+            self._set(node, "visible", bool(arrays))
+
     def _show_segments(self, name, ends, colour):
         """Show segments (k, 2, 3) as a node of their own; without any hide it."""
         node, count = self._layers.get(name), len(ends)
@@ -211,6 +227,28 @@ class ViewerScene:
             self._set(node, "visible", True)
         for node in self._labels[len(told) :]:
             self._set(node, "visible", False)
+
+
+def _material(data) -> dict:
+    """Return what all objects have in common, as viser takes it."""
+    return {"wireframe": data.wireframe, "opacity": None if data.contacts is None else SEE_THROUGH}
+
+
+def light_scene(api, eye, up):
+    """Put a soft light in the place of viser's own, which bleach colours beside its environment."""
+    api.set_up_direction(tuple(up))
+    api.configure_default_lights(False)
+    direction = up - np.cross(up, eye) + 0.6 * eye
+    api.add_light_directional("/light", position=tuple(direction), intensity=LIGHT, cast_shadow=False)
+
+
+def place_camera(first, ball, eye, up) -> np.ndarray:
+    """Put the first camera of a server where it sees a ball, (centre, radius); return the position."""
+    centre, radius = ball
+    position = centre + CAMERA_DISTANCE * radius * eye
+    first.position, first.look_at, first.up = tuple(position), tuple(centre), tuple(up)
+    first.near, first.far = radius / 500, 200 * radius
+    return position
 
 
 def _linear(colours) -> np.ndarray:
