@@ -120,7 +120,7 @@ def intersect_straddling_item(trees: Trees, pose: PairPose, item: wp.vec3i, sign
     """Return whether straddling faces meet, with the signs of `filter_planes`: 1, 0 or UNCERTAIN."""
     a = load_corner_ids(trees.states, pose.corner_a + item[1])
     b = load_corner_ids(trees.states, pose.corner_b + item[2])
-    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a[0], a[1], a[2], b[0], b[1], b[2])
+    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a, b)
     return filter_straddling(
         load_vertex(trees.models.vertex_pos, p1),
         load_vertex(trees.models.vertex_pos, q1),

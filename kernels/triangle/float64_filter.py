@@ -89,7 +89,7 @@ def float64_filter_triangles(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.ve
         return UNCERTAIN
     if signs == SHARED_CORNER:
         return 1
-    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a0, a1, a2, b0, b1, b2)
+    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, wp.matrix_from_rows(a0, a1, a2), wp.matrix_from_rows(b0, b1, b2))
     return filter_straddling(p1, q1, r1, p2, q2, r2)
 
 

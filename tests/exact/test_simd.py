@@ -30,6 +30,7 @@ wp.set_module_options(
         "search/descend.h",
         "intersect/float32_filter.h",
         "intersect/float64_filter.h",
+        "triangle/float32_filter.cuh",
     )
 )
 

@@ -127,14 +127,6 @@ struct NearOffer {
     }
 };
 
-// The corners of one face, in rows, in all lanes.
-template <class Rows>
-CUDA_CALLABLE void spread_corners(const Rows& rows, Float32::Point (&corners)[3]) {
-    const Float32::lanes zero = {};
-    for (int k = 0; k < 3; ++k)
-        corners[k] = Float32::Point{zero + rows.data[k][0], zero + rows.data[k][1], zero + rows.data[k][2]};
-}
-
 template <class Corners>
 CUDA_CALLABLE void offer_faces(const Corners& a, const Corners& b, wp::float32 gap, wp::float32 weight,
                                wp::array_t<wp::float32> directions, wp::vec_t<2, wp::int32> widths, wp::int32 face_a,

@@ -3,6 +3,7 @@
 #pragma once
 #include "builtin.h"
 #include "base/sizes.h"
+#include "exact/double_word.cuh"
 #include "exact/wide_integer.h"
 #include "exact/word_sum.h"
 

@@ -2,7 +2,7 @@
 // more, it also lists those that are apart, but not by more than the gap along the normal of a plane.
 #pragma once
 #include "builtin.h"
-#include "base/float32.h"
+#include "triangle/float32_filter.cuh"
 
 // Corners of 16 face pairs, whose items are given by halves, in A's frame.
 struct FilterCorners {
@@ -42,6 +42,47 @@ struct FilterCorners {
     }
 };
 
+// Of the signs of three corners over a plane those that are 1 and those that are -1, a bit each; where they lie on one
+// side, where they lie there farther than a gap, and where one is UNCERTAIN or all are 0.
+struct FilterSides {
+    typedef Float32 F;
+    unsigned int above[3], below[3], one_sided, far, uncertain;
+
+    static FilterSides make(const PlaneFilter::Heights& x) {
+        FilterSides s;
+        unsigned int none[3];
+        for (int i = 0; i < 3; ++i) {
+            s.above[i] = F::to_mask(x.value[i] > x.bound);
+            s.below[i] = F::to_mask(x.value[i] < -x.bound);
+            none[i] = ~(s.above[i] | s.below[i]);
+        }
+        s.one_sided = (s.above[0] & s.above[1] & s.above[2]) | (s.below[0] & s.below[1] & s.below[2]);
+        s.far = s.one_sided;
+        s.uncertain = (none[0] | none[1] | none[2]) & (~F::to_mask(x.bound == 0.0f) | (none[0] & none[1] & none[2]));
+        return s;
+    }
+    void find_far(const PlaneFilter::Heights& x, const F::lanes& wide) {
+        far = F::to_mask((x.value[0] > wide) & (x.value[1] > wide) & (x.value[2] > wide)) |
+              F::to_mask((x.value[0] < -wide) & (x.value[1] < -wide) & (x.value[2] < -wide));
+    }
+    // As `find_alone`, and the corners rotated so that this one comes first.
+    void rotate(const F::Point (&c)[3], F::bits& back, F::Point& p, F::Point& q, F::Point& last) const {
+        const unsigned int pair_above = above[0] & above[1], odd_above = above[0] ^ above[1];
+        const unsigned int pair_below = below[0] & below[1], odd_below = below[0] ^ below[1];
+        const unsigned int positive = (odd_above ^ above[2]) & ~(pair_above & above[2]);
+        const unsigned int negative = (odd_below ^ below[2]) & ~(pair_below & below[2]) & ~positive;
+        const unsigned int zero = ~(positive | negative);
+        auto is_kind = [&](int i) {
+            return F::widen((positive & above[i]) | (negative & below[i]) | (zero & ~(above[i] | below[i])));
+        };
+        const F::bits first = is_kind(0), second = is_kind(1);
+        back = F::widen(negative | (zero & (pair_above | (odd_above & above[2]))));
+        p = F::choose(first, c[0], F::choose(second, c[1], c[2]));
+        q = F::choose(first, c[1], F::choose(second, c[2], c[0]));
+        last = F::choose(first, c[2], F::choose(second, c[0], c[1]));
+    }
+};
+
 template <class ModelPool, class StatePool, class PairPose, class Filtered>
 void simd_float32_filter(const ModelPool& models, const StatePool& states, const PairPose& pose,
                          wp::vec_t<3, wp::float32> bounds, bool first_ends, wp::int32 waiting,
@@ -53,7 +94,8 @@ void simd_float32_filter(const ModelPool& models, const StatePool& states, const
     typedef F::Point Point;
     typedef int loose __attribute__((vector_size(64), aligned(4)));
     typedef wp::int64 longs __attribute__((vector_size(64)));
-    const float error = bounds[0], unit = bounds[1], gap = bounds[2];
+    const float error = bounds[0], gap = bounds[2];
+    const PlaneFilter filter = {error, bounds[1]};
     wp::int64 *list = faces.data, *rest = uncertain.data, *beside = apart.data;
     int met = 0, open = 0, done = 0, near_count = 0;
     if (error == __builtin_inff()) {
@@ -81,8 +123,13 @@ void simd_float32_filter(const ModelPool& models, const StatePool& states, const
         done += count;
         Point a[3], b[3];
         FilterCorners::load(models.vertex_near.data, states.face_corner.data, pose, low, high, a, b);
-        const F::Sides sides_a = F::sides_of_plane(error, unit, gap, b[0], b[1], b[2], a);
-        const F::Sides sides_b = F::sides_of_plane(error, unit, gap, a[0], a[1], a[2], b);
+        PlaneFilter::Heights of_a, of_b;
+        filter.compare_planes(a, b, of_a, of_b);
+        FilterSides sides_a = FilterSides::make(of_a), sides_b = FilterSides::make(of_b);
+        if (gap >= 0.0f) {
+            sides_a.find_far(of_a, filter.widen(of_a.bound, gap, b));
+            sides_b.find_far(of_b, filter.widen(of_b.bound, gap, a));
+        }
         const unsigned int one_sided = sides_a.one_sided | sides_b.one_sided, all = (1u << count) - 1;
         const unsigned int left = ~one_sided & all;
         auto keep_near = [&](unsigned int which) {
@@ -100,12 +147,19 @@ void simd_float32_filter(const ModelPool& models, const StatePool& states, const
         }
         bits back_a, back_b;
         Point p1, q1, r1, p2, q2, r2;
-        F::rotate(sides_a, a, back_a, p1, q1, r1);
-        F::rotate(sides_b, b, back_b, p2, q2, r2);
-        const F::Side s = F::side_of_plane(error, unit, p1, F::choose(back_b, r1, q1), p2, F::choose(back_a, r2, q2));
-        const F::Side e = F::side_of_plane(error, unit, p1, F::choose(back_b, q1, r1), F::choose(back_a, q2, r2), p2);
-        const unsigned int clear = s.above | e.above;
-        const unsigned int opens = left & (planes_open | (~clear & (s.uncertain | e.uncertain)));
+        sides_a.rotate(a, back_a, p1, q1, r1);
+        sides_b.rotate(b, back_b, p2, q2, r2);
+        unsigned int clear = 0, ends_open = 0;
+        auto order = [&](const Point& p, const Point& q, const Point& r, const Point& t) {
+            F::lanes bound;
+            const F::lanes value = filter.side_of_plane(p, q, r, t, bound);
+            const unsigned int above = F::to_mask(value > bound);
+            clear |= above;
+            ends_open |= ~(above | F::to_mask(value < -bound) | F::to_mask(bound == 0.0f));
+        };
+        order(p1, F::choose(back_b, r1, q1), p2, F::choose(back_a, r2, q2));
+        order(p1, F::choose(back_b, q1, r1), F::choose(back_a, q2, r2), p2);
+        const unsigned int opens = left & (planes_open | (~clear & ends_open));
         const unsigned int meet = left & ~opens & ~clear;
         if (gap >= 0.0f)
             keep_near(left & ~opens & clear);
