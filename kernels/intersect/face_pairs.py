@@ -12,12 +12,11 @@ from warp_abtree.kernels.triangle.float32_filter import (
     FLOAT32_UNIT,
     are_uncertain,
     gap_signs,
-    have_one_side,
     intersect_straddling,
     plane_signs,
-    rotate_corners,
 )
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
+from warp_abtree.kernels.triangle.signs import have_one_side, rotate_corners
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

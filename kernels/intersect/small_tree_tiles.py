@@ -26,14 +26,8 @@ from warp_abtree.kernels.exact.predicates import UNCERTAIN
 from warp_abtree.kernels.intersect.face_pairs import OUTPUT_FACES, Hits, defer_uncertain, report_hit
 from warp_abtree.kernels.search.warp_search import TraversalTests
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_near
-from warp_abtree.kernels.triangle.float32_filter import (
-    FLOAT32_UNIT,
-    SEPARATED,
-    are_uncertain,
-    intersect_straddling,
-    plane_signs,
-    rotate_corners,
-)
+from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, are_uncertain, intersect_straddling, plane_signs
+from warp_abtree.kernels.triangle.signs import SEPARATED, rotate_corners
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

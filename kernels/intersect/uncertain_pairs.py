@@ -15,13 +15,13 @@ from warp_abtree.kernels.exact.predicates import EXACT, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, OUTPUT_FACES, Hits, list_apart, report_hit, test_faces
 from warp_abtree.kernels.search.warp_stack import push_signed_pair, read_signed_pair, signed_pairs
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair
-from warp_abtree.kernels.triangle.float32_filter import SEPARATED, rotate_corners
 from warp_abtree.kernels.triangle.float64_filter import (
     PLANES_UNDECIDED,
     SHARED_CORNER,
     filter_planes,
     filter_straddling,
 )
+from warp_abtree.kernels.triangle.signs import SEPARATED, rotate_corners
 
 RESOLVE_THREADS = RESOLVE_WARPS * WARP_SIZE  # of a block
 MODULE_OPTIONS = native.options(

@@ -8,27 +8,17 @@ the arithmetic of a determinant by `unit` of its size. docs/exactness.md proves 
 computed one.
 
 `native/triangle/float32_filter.cuh` has the determinants, of one pair or, for `simd.simd_float32_filter`, of 16.
-
-The word of six signs, two bits each, + where the sign is positive and - where it is negative, or -1 for SEPARATED:
-
-    11 10 9  8  7  6  5  4  3  2  1  0
-    [+|-][+|-][+|-][+|-][+|-][+|-]
-     a0   a1   a2   b0   b1   b2      a corner of A against B's plane, then of B against A's
 """
-
-from typing import Any
 
 import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.exact.predicates import UNCERTAIN
-from warp_abtree.kernels.triangle.intersect import rotate_first
+from warp_abtree.kernels.triangle.signs import POSITIVE, SEPARATED, SIGNS_OF_A, SIGNS_OF_B, rotate_corners
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 FLOAT32_UNIT = wp.constant(9.0 * 2.0**-24)
-SEPARATED = wp.constant(-1)
-SIGNS_OF_A, SIGNS_OF_B, POSITIVE = wp.constant(0xFC0), wp.constant(0x3F), wp.constant(0xAAA)
 
 
 @native.func_native()
@@ -46,15 +36,6 @@ def gap_signs(error: wp.float32, unit: wp.float32, gap: wp.float32, a: wp.mat33,
 
 
 @wp.func
-def have_one_side(signs: wp.int32):
-    """Return whether the signs say that one triangle lies on one side of the other's plane."""
-    over, under = signs & POSITIVE, (signs << 1) & POSITIVE
-    one_of_a = (over & SIGNS_OF_A) == (POSITIVE & SIGNS_OF_A) or (under & SIGNS_OF_A) == (POSITIVE & SIGNS_OF_A)
-    one_of_b = (over & SIGNS_OF_B) == (POSITIVE & SIGNS_OF_B) or (under & SIGNS_OF_B) == (POSITIVE & SIGNS_OF_B)
-    return one_of_a or one_of_b
-
-
-@wp.func
 def are_uncertain(unit: wp.float32, signs: wp.int32):
     """Return whether signs of straddling triangles leave it to the next stage: a shared plane, or a sign unknown.
 
@@ -63,35 +44,6 @@ def are_uncertain(unit: wp.float32, signs: wp.int32):
     known = ((signs >> 1) | signs) & (POSITIVE >> 1)
     coplanar = (known & SIGNS_OF_A) == 0 or (known & SIGNS_OF_B) == 0
     return coplanar or (known != (POSITIVE >> 1) and unit != 0.0)
-
-
-@wp.func
-def find_alone_in(signs: wp.int32):
-    """Return which corner is alone on its side, as `find_alone` of three signs, and whether it is the negative one."""
-    over = signs & 42
-    under = (signs & 21) << 1
-    one_over = wp.bit_count(over) == 1
-    one_under = wp.bit_count(under) == 1
-    alone = wp.where(one_over, over, wp.where(one_under, under, 42 ^ (over | under)))
-    corner = wp.where(alone == 32, 0, wp.where(alone == 8, 1, 2))
-    return corner, wp.where(one_over, False, wp.where(one_under, True, over != 0))
-
-
-@wp.func
-def rotate_corners(signs: wp.int32, a: Any, b: Any):
-    """Return both triangles' corners, or their ids, as `rotate_triangles`; in any order where these are coplanar."""
-    alone_a, back_a = find_alone_in(signs >> 6)
-    alone_b, back_b = find_alone_in(signs)
-    p1, q1, r1 = rotate_first(alone_a, a[0], a[1], a[2])
-    p2, q2, r2 = rotate_first(alone_b, b[0], b[1], b[2])
-    return (
-        p1,
-        wp.where(back_b, r1, q1),
-        wp.where(back_b, q1, r1),
-        p2,
-        wp.where(back_a, r2, q2),
-        wp.where(back_a, q2, r2),
-    )
 
 
 @native.func_native()

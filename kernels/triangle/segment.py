@@ -12,7 +12,7 @@ from warp_abtree.kernels.base.lanes import lowest_bit
 from warp_abtree.kernels.exact.expansion import expand_area, expand_volume
 from warp_abtree.kernels.exact.predicates import BOUND_2D, BOUND_3D, EXACT, drop_axis, orient2d, orient3d, plain_sign
 from warp_abtree.kernels.triangle.coplanar import find_ends, widest_axis
-from warp_abtree.kernels.triangle.intersect import find_alone, is_one_sided
+from warp_abtree.kernels.triangle.signs import find_alone, is_one_sided, pack_signs
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -97,12 +97,12 @@ def cross_planes(corner: wp.array(dtype=wp.vec3d), volume: wp.array(dtype=wp.flo
     sb = wp.vec3i(plain_sign(volume[3]), plain_sign(volume[4]), plain_sign(volume[5]))
     if is_one_sided(sa[0], sa[1], sa[2]) or is_one_sided(sb[0], sb[1], sb[2]):
         return 0, none, none
-    ap, side_a = find_alone(sa[0], sa[1], sa[2])
-    bp, side_b = find_alone(sb[0], sb[1], sb[2])
-    aq = wp.where(side_b > 0, (ap + 1) % 3, (ap + 2) % 3)
-    ar = wp.where(side_b > 0, (ap + 2) % 3, (ap + 1) % 3)
-    bq = 3 + wp.where(side_a > 0, (bp + 1) % 3, (bp + 2) % 3)
-    br = 3 + wp.where(side_a > 0, (bp + 2) % 3, (bp + 1) % 3)
+    ap, back_a = find_alone(pack_signs(sa[0], sa[1], sa[2]))
+    bp, back_b = find_alone(pack_signs(sb[0], sb[1], sb[2]))
+    aq = wp.where(back_b, (ap + 2) % 3, (ap + 1) % 3)
+    ar = wp.where(back_b, (ap + 1) % 3, (ap + 2) % 3)
+    bq = 3 + wp.where(back_a, (bp + 2) % 3, (bp + 1) % 3)
+    br = 3 + wp.where(back_a, (bp + 1) % 3, (bp + 2) % 3)
     bp = 3 + bp
     # Signs that order X(q) and X(r) (bit 0) against Y(q) and Y(r) (bit 1): 1 where X comes after Y.
     order = wp.vec4i()
@@ -120,7 +120,7 @@ def cross_planes(corner: wp.array(dtype=wp.vec3d), volume: wp.array(dtype=wp.flo
     end = cross_edge(corner[ap], corner[ar], volume[ap], volume[ar])
     if order[1] > 0:
         end = cross_edge(corner[bp], corner[bq], volume[bp], volume[bq])
-    if side_a * side_b < 0:
+    if back_a != back_b:
         return 2, end, start
     return 2, start, end
 

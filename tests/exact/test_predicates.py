@@ -14,14 +14,8 @@ from warp_abtree.kernels.exact.exact import exact_orient2d, exact_orient3d, exac
 from warp_abtree.kernels.exact.expansion import EXPANSION_LANES, expand_area, expand_volume, two_product
 from warp_abtree.kernels.exact.int128 import integer_orient2d, integer_orient3d
 from warp_abtree.kernels.exact.predicates import UNCERTAIN, orient2d, orient3d, orient_edges
-from warp_abtree.kernels.triangle.float32_filter import (
-    FLOAT32_UNIT,
-    SEPARATED,
-    gap_signs,
-    have_one_side,
-    plane_signs,
-    side_of_plane,
-)
+from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, gap_signs, plane_signs, side_of_plane
+from warp_abtree.kernels.triangle.signs import SEPARATED, have_one_side
 
 wp.set_module_options(native.options("exact/determinant.cuh", "exact/expansion.cuh", "triangle/float32_filter.cuh"))
 

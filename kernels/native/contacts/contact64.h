@@ -14,7 +14,7 @@ struct Contact64 : SharedSegment<Lanes64> {
         return Point{(m[0][0] * v.x + m[0][1] * v.y) + m[0][2] * v.z, (m[1][0] * v.x + m[1][1] * v.y) + m[1][2] * v.z,
                      (m[2][0] * v.x + m[2][1] * v.y) + m[2][2] * v.z};
     }
-    static Point pose(const double (&m)[3][3], const wp::vec_t<3, wp::float64>& t, const Point& p) {
+    static Point pose(const double (&m)[3][3], const wp::vec3d& t, const Point& p) {
         const Point v = turn(m, p);
         const lanes x = v.x + t[0], y = v.y + t[1], z = v.z + t[2];
         return Point{F::absolute(x) < COORDINATE_MIN ? lanes{} : x, F::absolute(y) < COORDINATE_MIN ? lanes{} : y,

@@ -13,21 +13,21 @@ struct ContactFinder {
     typedef F::Point Point;
     const PairPose& pose;
     const Contacts& contacts;
-    const wp::mat_t<3, 3, wp::float64>& rotation;
-    const wp::vec_t<3, wp::float64>& position;
-    const wp::vec_t<3, wp::int32>* faces;
+    const wp::mat33d& rotation;
+    const wp::vec3d& position;
+    const wp::vec3i* faces;
     const double* vertices;
-    const wp::vec_t<4, wp::int32>* corners;
+    const wp::vec4i* corners;
     bool proven, with_gap, back;
-    wp::vec_t<3, wp::float64>* target[5];
+    wp::vec3d* target[5];
 
     // Corners of so many face pairs, in A's frame.
     void load(const int* hit, int count, Point (&a)[3], Point (&b)[3]) const {
         int start[6][8];
         for (int k = 0; k < 8; ++k) {
-            const wp::vec_t<3, wp::int32>& pair = faces[hit[k < count ? k : 0]];
-            const wp::vec_t<4, wp::int32>& a = corners[pose.corner_a + pair[back ? 2 : 1]];
-            const wp::vec_t<4, wp::int32>& b = corners[pose.corner_b + pair[back ? 1 : 2]];
+            const wp::vec3i& pair = faces[hit[k < count ? k : 0]];
+            const wp::vec4i& a = corners[pose.corner_a + pair[back ? 2 : 1]];
+            const wp::vec4i& b = corners[pose.corner_b + pair[back ? 1 : 2]];
             for (int i = 0; i < 3; ++i) {
                 start[i][k] = 4 * a[i];
                 start[3 + i][k] = 4 * b[i];
@@ -116,9 +116,8 @@ struct ContactFinder {
 };
 
 template <class ModelPool, class StatePool, class PairPose, class Contacts>
-wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const PairPose& pose,
-                        wp::mat_t<3, 3, wp::float64> rotation, wp::vec_t<3, wp::float64> position, bool proven,
-                        wp::vec_t<3, wp::int32> span, wp::array_t<wp::vec_t<3, wp::int32>> faces,
+wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const PairPose& pose, wp::mat33d rotation,
+                        wp::vec3d position, bool proven, wp::vec3i span, wp::array_t<wp::vec3i> faces,
                         wp::array_t<wp::int32> place, const Contacts& contacts) {
 #pragma clang fp contract(off)
     const bool with_gap = contacts.separation.shape[0] != 0;

@@ -73,7 +73,7 @@ inline CUDA_CALLABLE wp::vec2d double_orient3d(wp::vec3d a, wp::vec3d b, wp::vec
     return wp::vec2d(value.high, value.low);
 }
 
-inline CALLED wp::vec2d double_orient2d(wp::vec2d a, wp::vec2d b, wp::vec2d c) {
+inline CUDA_CALLABLE wp::vec2d double_orient2d(wp::vec2d a, wp::vec2d b, wp::vec2d c) {
     const DoubleWord value = DoubleWord::orient2d(a[0], a[1], b[0], b[1], c[0], c[1]);
     return wp::vec2d(value.high, value.low);
 }

@@ -2,45 +2,27 @@
 // more, it also lists those that are apart, but not by more than the gap along the normal of a plane.
 #pragma once
 #include "builtin.h"
+#include "triangle/face_items.h"
 #include "triangle/float32_filter.cuh"
 
-// Corners of 16 face pairs, whose items are given by halves, in A's frame.
-struct FilterCorners {
+// In A's frame and scaled, of corners in the frames of their models.
+template <class PairPose>
+inline void pose_corners(const PairPose& pose, Float32::Point (&a)[3], Float32::Point (&b)[3]) {
     typedef Float32 F;
-    typedef F::lanes lanes;
-    typedef F::Point Point;
-    typedef unsigned int counts __attribute__((vector_size(64)));
-
-    template <class PairPose>
-    static void load(const void* near, const void* corners, const PairPose& pose, const F::bits& low,
-                     const F::bits& high, Point (&a)[3], Point (&b)[3]) {
-        const auto& r = pose.rotation32.data;
-        const auto& t = pose.translation32;
-        const float scale = (float)pose.scale;
-        // Rows of two faces, then of six corners: the high halves of the items, and the low ones.
-        alignas(64) F::sixteen face[2], corner[6];
-        *(counts*)face[0] = 2 * (counts)(pose.corner_a + __builtin_shufflevector(low, high, 1, 3, 5, 7, 9, 11, 13, 15,
-                                                                                 17, 19, 21, 23, 25, 27, 29, 31));
-        *(counts*)face[1] = 2 * (counts)(pose.corner_b + __builtin_shufflevector(low, high, 0, 2, 4, 6, 8, 10, 12, 14,
-                                                                                 16, 18, 20, 22, 24, 26, 28, 30));
-        for (int i = 0; i < 2; ++i) {
-            const Point c = F::gather(corners, face[i]);
-            *(counts*)corner[3 * i] = 2 * (counts)c.x;
-            *(counts*)corner[3 * i + 1] = 2 * (counts)c.y;
-            *(counts*)corner[3 * i + 2] = 2 * (counts)c.z;
+    const auto& r = pose.rotation32.data;
+    const auto& t = pose.translation32;
+    const float scale = (float)pose.scale;
+    for (int k = 0; k < 3; ++k) {
+        const F::Point p = a[k], q = b[k];
+        a[k] = F::Point{p.x * scale, p.y * scale, p.z * scale};
+        F::lanes x[3];
+        for (int i = 0; i < 3; ++i) {
+            x[i] = F::fuse(F::every(r[i][2]), q.z, F::every(t[i]));
+            x[i] = F::fuse(F::every(r[i][0]), q.x, F::fuse(F::every(r[i][1]), q.y, x[i]));
         }
-        for (int k = 0; k < 3; ++k) {
-            const Point p = F::gather(near, corner[k]), q = F::gather(near, corner[3 + k]);
-            a[k] = Point{p.x * scale, p.y * scale, p.z * scale};
-            lanes x[3];
-            for (int i = 0; i < 3; ++i) {
-                x[i] = F::fuse(F::every(r[i][2]), q.z, F::every(t[i]));
-                x[i] = F::fuse(F::every(r[i][0]), q.x, F::fuse(F::every(r[i][1]), q.y, x[i]));
-            }
-            b[k] = Point{x[0] * scale, x[1] * scale, x[2] * scale};
-        }
+        b[k] = F::Point{x[0] * scale, x[1] * scale, x[2] * scale};
     }
-};
+}
 
 // Of the signs of three corners over a plane those that are 1 and those that are -1, a bit each; where they lie on one
 // side, where they lie there farther than a gap, and where one is UNCERTAIN or all are 0.
@@ -84,16 +66,13 @@ struct FilterSides {
 };
 
 template <class ModelPool, class StatePool, class PairPose, class Filtered>
-void simd_float32_filter(const ModelPool& models, const StatePool& states, const PairPose& pose,
-                         wp::vec_t<3, wp::float32> bounds, bool first_ends, wp::int32 waiting,
-                         wp::array_t<wp::int64> faces, wp::array_t<wp::int64> uncertain, wp::array_t<wp::int64> apart,
-                         Filtered& found) {
+void simd_float32_filter(const ModelPool& models, const StatePool& states, const PairPose& pose, wp::vec3 bounds,
+                         bool first_ends, wp::int32 waiting, wp::array_t<wp::int64> faces,
+                         wp::array_t<wp::int64> uncertain, wp::array_t<wp::int64> apart, Filtered& found) {
 #pragma clang fp contract(off)
     typedef Float32 F;
     typedef F::bits bits;
     typedef F::Point Point;
-    typedef int loose __attribute__((vector_size(64), aligned(4)));
-    typedef wp::int64 longs __attribute__((vector_size(64)));
     const float error = bounds[0], gap = bounds[2];
     const PlaneFilter filter = {error, bounds[1]};
     wp::int64 *list = faces.data, *rest = uncertain.data, *beside = apart.data;
@@ -105,24 +84,11 @@ void simd_float32_filter(const ModelPool& models, const StatePool& states, const
     }
     while (done < waiting && (done == 0 || met == 0 || !first_ends)) {
         const int count = waiting - done < 16 ? waiting - done : 16;
-        const wp::int64* items = list + done;
-        const longs lane = {0, 1, 2, 3, 4, 5, 6, 7}, some = longs{} + items[0];
-        const bits low = (bits)(lane < count ? (longs) * (const loose*)items : some);
-        const bits high = (bits)(lane + 8 < count ? (longs) * (const loose*)(items + 8) : some);
-        auto append = [&](wp::int64* to, unsigned int which) {
-#if defined(__AVX512VL__)
-            const longs first = __builtin_ia32_compressdi512_mask((longs)low, longs{}, which);
-            const longs second = __builtin_ia32_compressdi512_mask((longs)high, longs{}, which >> 8);
-            *(loose*)to = (loose)first;
-            *(loose*)(to + __builtin_popcount(which & 255)) = (loose)second;
-#else
-            for (int n = 0; which != 0; which &= which - 1)
-                to[n++] = items[__builtin_ctz(which)];
-#endif
-        };
+        const FaceItems items(list + done, count);
         done += count;
         Point a[3], b[3];
-        FilterCorners::load(models.vertex_near.data, states.face_corner.data, pose, low, high, a, b);
+        items.gather(models.vertex_near.data, states.face_corner.data, pose.corner_a, pose.corner_b, a, b);
+        pose_corners(pose, a, b);
         PlaneFilter::Heights of_a, of_b;
         filter.compare_planes(a, b, of_a, of_b);
         FilterSides sides_a = FilterSides::make(of_a), sides_b = FilterSides::make(of_b);
@@ -132,17 +98,13 @@ void simd_float32_filter(const ModelPool& models, const StatePool& states, const
         }
         const unsigned int one_sided = sides_a.one_sided | sides_b.one_sided, all = (1u << count) - 1;
         const unsigned int left = ~one_sided & all;
-        auto keep_near = [&](unsigned int which) {
-            append(beside + near_count, which);
-            near_count += __builtin_popcount(which);
-        };
+        auto keep_near = [&](unsigned int which) { near_count += items.append(beside + near_count, which); };
         if (gap >= 0.0f)
             keep_near(all & one_sided & ~(sides_a.far | sides_b.far));
         const unsigned int planes_open = sides_a.uncertain | sides_b.uncertain;
         // For coincident or nearly coincident meshes, usually every pair is uncertain here.
         if ((left & ~planes_open) == 0) {
-            append(rest + open, left);
-            open += __builtin_popcount(left);
+            open += items.append(rest + open, left);
             continue;
         }
         bits back_a, back_b;
@@ -163,13 +125,10 @@ void simd_float32_filter(const ModelPool& models, const StatePool& states, const
         const unsigned int meet = left & ~opens & ~clear;
         if (gap >= 0.0f)
             keep_near(left & ~opens & clear);
-        if (opens != 0) {
-            append(rest + open, opens);
-            open += __builtin_popcount(opens);
-        }
+        if (opens != 0)
+            open += items.append(rest + open, opens);
         // Last: those that meet take the place of pairs that were tested, perhaps of these.
-        append(list + met, meet);
-        met += __builtin_popcount(meet);
+        met += items.append(list + met, meet);
     }
     found.met = met;
     found.uncertain = open;

@@ -41,7 +41,7 @@ struct SharedSegment : Points64<Number> {
         open |= Number::negate(after | before) & (bound != 0.0);
         return after;
     }
-    // As `rotate_triangles` where no corner touches. Adds those of which all corners are on one side to a mask.
+    // As `rotate_corners` where no corner touches. Adds those of which all corners are on one side to a mask.
     static CUDA_CALLABLE Rotated rotate(const Point (&c)[3], const lanes (&x)[3], bits& open) {
         const bits up0 = x[0] > 0.0, up1 = x[1] > 0.0, up2 = x[2] > 0.0, odd = up0 ^ up1, other = up1 ^ up2;
         const bits first = odd & Number::negate(other), second = odd & other;
