@@ -12,6 +12,7 @@ from warp_abtree.kernels.triangle.signs import (
     SIGNS_OF_B,
     have_one_side,
     is_one_sided,
+    pack_sign,
     pack_signs,
     rotate_corners,
 )
@@ -41,12 +42,6 @@ def pick_corners(k: wp.int32, a0: Any, a1: Any, a2: Any, b0: Any, b1: Any, b2: A
     if k % 3 == 2:
         d = wp.where(of_a, a2, b2)
     return wp.where(of_a, b0, a0), wp.where(of_a, b1, a1), wp.where(of_a, b2, a2), d
-
-
-@wp.func
-def pack_sign(k: wp.int32, sign: wp.int32):
-    """Return the bits of the k-th sign of a word."""
-    return wp.where(sign > 0, 2, wp.where(sign < 0, 1, 0)) << (10 - 2 * k)
 
 
 @wp.func

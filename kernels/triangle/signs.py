@@ -23,6 +23,12 @@ def is_one_sided(s0: wp.int32, s1: wp.int32, s2: wp.int32):
 
 
 @wp.func
+def pack_sign(k: wp.int32, sign: wp.int32):
+    """Return the bits of the k-th sign of a word."""
+    return wp.where(sign > 0, 2, wp.where(sign < 0, 1, 0)) << (10 - 2 * k)
+
+
+@wp.func
 def pack_signs(s0: wp.int32, s1: wp.int32, s2: wp.int32):
     """Return three signs as two bits each, whether it is positive and whether negative.
 
