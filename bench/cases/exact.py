@@ -21,7 +21,7 @@ from ..timing import ratio_of, summarise, time_in_turn
 from ..triangle_pairs import ADVERSARIAL, make_chunk
 from ..verify import count_differences, load_oracle
 
-MODULE_OPTIONS = testing.kernel_options("exact/determinant.cuh", "base/lanes.cuh")
+MODULE_OPTIONS = testing.kernel_options("exact/determinant.cuh", "base/lanes.cuh", "triangle/float32_filter.cuh")
 PRECISIONS = ("exact", "float32")
 FULL = {"faces": 5000, "pairs": 256, "coincident": 16, "repeats": 11}
 QUICK = {"faces": 300, "pairs": 3, "coincident": 1, "repeats": 1}
@@ -131,7 +131,10 @@ def float32_pair_kernel(
 ):
     i = wp.tid()
     answer_out[i] = testing.float32_filter_triangles(
-        error, unit, corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
+        error,
+        unit,
+        wp.matrix_from_rows(corners[i, 0], corners[i, 1], corners[i, 2]),
+        wp.matrix_from_rows(corners[i, 3], corners[i, 4], corners[i, 5]),
     )
 
 

@@ -9,11 +9,18 @@ from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.exact.expansion import EXPANSION_LANES
 from warp_abtree.kernels.intersect.uncertain_pairs import items_at_once
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_corners
-from warp_abtree.kernels.triangle.segment import face_normal, intersect_faces, unit_vector
-from warp_abtree.kernels.triangle.segment_filter import filter_normal, filter_segment
+from warp_abtree.kernels.triangle.segment import (
+    face_normal,
+    filter_normal,
+    filter_segment,
+    intersect_faces,
+    unit_vector,
+)
 
 wp.set_module_options(
-    native.options("base/lanes.cuh", "contacts/contacts.h", "exact/determinant.cuh", "exact/expansion.cuh")
+    native.options(
+        "base/lanes.cuh", "contacts/contacts.h", "exact/determinant.cuh", "exact/expansion.cuh", "triangle/segment.cuh"
+    )
 )
 
 # Differences of unit normals, and means of them, that are shorter have no direction worth the name.

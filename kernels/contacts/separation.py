@@ -34,7 +34,7 @@ from warp_abtree.kernels.triangle.triangle_pair import (
     scale_triangles,
 )
 
-wp.set_module_options(native.options("base/counters.cuh"))
+wp.set_module_options(native.options("base/counters.cuh", "exact/double_word.cuh"))
 
 # Separations are no smaller in magnitude, so that their sign says which faces intersect, as float32 too.
 LEAST_SEPARATION = wp.constant(wp.float64(2.0**-126))
@@ -45,7 +45,8 @@ CLOSEST = wp.constant(wp.float64(2.0**-60))
 @wp.func
 def signed_area_nearly(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
     """Return det(a - c, b - c) with a relative error of at most RELATIVE_ERROR, 0 where it is lost in 2^-100."""
-    value, size = round_area(a, b, c)
+    area = round_area(a, b, c)
+    value, size = area[0], area[1]
     if BOUND_2D * size > RELATIVE_ERROR * wp.abs(value):
         double = double_orient2d(a, b, c)
         value = wp.where(wp.abs(double[0]) <= BOUND_DOUBLE * size, wp.float64(0.0), double[0])

@@ -5,8 +5,6 @@ Every product is either exact by `fuse_multiply` or written with a separate sum,
 contraction (`fuse_fp` off on CUDA; Warp's CPU backend does not contract), so no compiler changes a rounding.
 """
 
-from typing import Any
-
 import warp as wp
 
 from warp_abtree.kernels import native
@@ -19,15 +17,6 @@ EXPANSION_LANES = wp.constant(native.constant("EXPANSION_LANES"))
 
 @wp.func_native("""return fma(a, b, c);""")
 def fuse_multiply(a: wp.float64, b: wp.float64, c: wp.float64) -> wp.float64: ...
-
-
-@wp.func
-def two_sum(a: Any, b: Any):
-    """Return a + b as (rounded sum, rounding error), of numbers or of vectors. Source: Shewchuk, theorem 7 (Knuth)."""
-    x = a + b
-    virtual_b = x - a
-    virtual_a = x - virtual_b
-    return x, (a - virtual_a) + (b - virtual_b)
 
 
 @wp.func

@@ -10,9 +10,9 @@ from typing import Any
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.exact.double_word import BOUND_DOUBLE, double_orient2d, double_orient3d
 from warp_abtree.kernels.exact.exact import exact_orient2d, exact_orient3d
-from warp_abtree.kernels.exact.expansion import fuse_multiply
 from warp_abtree.kernels.exact.int128 import integer_orient2d, integer_orient3d
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -66,27 +66,21 @@ def resolve_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, size: wp.float64):
     return sign
 
 
-@wp.func
-def fused_minor(a: wp.float64, b: wp.float64, c: wp.float64, d: wp.float64):
-    """Return a b - c d and |a b| + |c d|."""
-    p = c * d
-    return fuse_multiply(a, b, -p), fuse_multiply(wp.abs(a), wp.abs(b), wp.abs(p))
+@native.func_native()
+def rows_determinant(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec2d:
+    """Return det(u, v, w) of three differences, and the sum of magnitudes."""
 
 
-@wp.func
-def fused_sum(u: wp.vec3d, x: wp.float64, y: wp.float64, z: wp.float64):
-    return fuse_multiply(u[2], z, fuse_multiply(u[1], y, u[0] * x))
+@native.func_native()
+def edges_determinant(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec2d:
+    """Return `rows_determinant` of the ends of two edges, a b and c d, of the rows that err less."""
 
 
 @wp.func
 def filter_rows(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
     """Return the sign of det(u, v, w) of three differences or UNCERTAIN, and the sum of magnitudes."""
-    x, x_size = fused_minor(v[1], w[2], v[2], w[1])
-    y, y_size = fused_minor(w[1], u[2], w[2], u[1])
-    z, z_size = fused_minor(u[1], v[2], u[2], v[1])
-    heads = wp.vec3d(u[0], v[0], w[0])
-    size = fused_sum(wp.abs(heads), x_size, y_size, z_size)
-    return filtered_sign(fused_sum(heads, x, y, z), BOUND_3D * size), size
+    value = rows_determinant(u, v, w)
+    return filtered_sign(value[0], BOUND_3D * value[1]), value[1]
 
 
 @wp.func
@@ -98,20 +92,6 @@ def filter_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 @wp.func
 def sum_sizes64(v: wp.vec3d):
     return (wp.abs(v[0]) + wp.abs(v[1])) + wp.abs(v[2])
-
-
-@wp.func
-def filter_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return the sign of `orient_edges` or UNCERTAIN.
-
-    Rows may be taken from one another: det(a - d, b - c, c - d) and det(a - c, b - d, c - d) are the same number. Ends
-    of edges that are laid on one another nearly coincide, so one of the two has rows that are nearly nothing, and an
-    error as small.
-    """
-    ac, ad, bc, bd = a - c, a - d, b - c, b - d
-    across = sum_sizes64(ad) * sum_sizes64(bc) < sum_sizes64(ac) * sum_sizes64(bd)
-    sign, _ = filter_rows(wp.where(across, ad, ac), wp.where(across, bc, bd), c - d)
-    return sign
 
 
 @wp.func
@@ -142,7 +122,8 @@ def orient_edges(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.ve
     """Return `orient3d` of the ends of two edges, a b and c d."""
     if mode == FLOAT32:
         return plain_orient3d(a, b, c, d)
-    sign = filter_edges(a, b, c, d)
+    value = edges_determinant(a, b, c, d)
+    sign = filtered_sign(value[0], BOUND_3D * value[1])
     if mode == EXACT and sign == UNCERTAIN:
         sign = orient3d(EXACT, a, b, c, d)
     return sign

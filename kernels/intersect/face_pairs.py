@@ -12,12 +12,11 @@ from warp_abtree.kernels.triangle.float32_filter import (
     FLOAT32_UNIT,
     are_uncertain,
     gap_signs,
-    have_one_side,
     intersect_straddling,
     plane_signs,
-    rotate_corners,
 )
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
+from warp_abtree.kernels.triangle.signs import have_one_side, rotate_corners
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -68,13 +67,20 @@ class Hits:
 
 
 @wp.func
-def near_of_a(models: ModelPool, pose: PairPose, vertex: wp.int32):
-    return load_near(models, vertex) * wp.float32(pose.scale)
+def near_of_b(models: ModelPool, pose: PairPose, vertex: wp.int32):
+    return map_point(pose.rotation32, pose.translation32, load_near(models, vertex))
 
 
 @wp.func
-def near_of_b(models: ModelPool, pose: PairPose, vertex: wp.int32):
-    return map_point(pose.rotation32, pose.translation32, load_near(models, vertex)) * wp.float32(pose.scale)
+def near_corners(models: ModelPool, pose: PairPose, a: wp.vec4i, b: wp.vec4i):
+    """Return the corners of a face of A and of one of B in A's frame, about its centre and scaled, a row each."""
+    scale, m = wp.float32(pose.scale), models
+    return (
+        wp.matrix_from_rows(load_near(m, a[0]) * scale, load_near(m, a[1]) * scale, load_near(m, a[2]) * scale),
+        wp.matrix_from_rows(
+            near_of_b(m, pose, b[0]) * scale, near_of_b(m, pose, b[1]) * scale, near_of_b(m, pose, b[2]) * scale
+        ),
+    )
 
 
 @wp.func
@@ -97,19 +103,10 @@ def face_plane_signs(mode: wp.int32, trees: Trees, pose: PairPose, face_a: wp.in
     a = load_corner_ids(trees.states, pose.corner_a + face_a)
     b = load_corner_ids(trees.states, pose.corner_b + face_b)
     error, unit = float32_bounds(mode, pose)
-    a0, a1, a2 = (
-        near_of_a(trees.models, pose, a[0]),
-        near_of_a(trees.models, pose, a[1]),
-        near_of_a(trees.models, pose, a[2]),
-    )
-    b0, b1, b2 = (
-        near_of_b(trees.models, pose, b[0]),
-        near_of_b(trees.models, pose, b[1]),
-        near_of_b(trees.models, pose, b[2]),
-    )
+    near_a, near_b = near_corners(trees.models, pose, a, b)
     if mode == GAP:
-        return gap_signs(error, unit, scaled_gap(pose), a0, a1, a2, b0, b1, b2)
-    return plane_signs(error, unit, a0, a1, a2, b0, b1, b2)
+        return gap_signs(error, unit, scaled_gap(pose), near_a, near_b)
+    return plane_signs(error, unit, near_a, near_b)
 
 
 @wp.func
@@ -124,17 +121,9 @@ def intersect_straddling_faces(
         return UNCERTAIN
     a = load_corner_ids(trees.states, pose.corner_a + face_a)
     b = load_corner_ids(trees.states, pose.corner_b + face_b)
-    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a[0], a[1], a[2], b[0], b[1], b[2])
-    return intersect_straddling(
-        error,
-        unit,
-        near_of_a(trees.models, pose, p1),
-        near_of_a(trees.models, pose, q1),
-        near_of_a(trees.models, pose, r1),
-        near_of_b(trees.models, pose, p2),
-        near_of_b(trees.models, pose, q2),
-        near_of_b(trees.models, pose, r2),
-    )
+    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a, b)
+    near_a, near_b = near_corners(trees.models, pose, wp.vec4i(p1, q1, r1, 0), wp.vec4i(p2, q2, r2, 0))
+    return intersect_straddling(error, unit, near_a, near_b)
 
 
 @wp.func

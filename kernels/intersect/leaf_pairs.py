@@ -30,7 +30,7 @@ from warp_abtree.kernels.search.warp_stack import (
     read_item,
     read_signs,
 )
-from warp_abtree.kernels.triangle.float32_filter import SEPARATED
+from warp_abtree.kernels.triangle.signs import SEPARATED
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -26,14 +26,8 @@ from warp_abtree.kernels.exact.predicates import UNCERTAIN
 from warp_abtree.kernels.intersect.face_pairs import OUTPUT_FACES, Hits, defer_uncertain, report_hit
 from warp_abtree.kernels.search.warp_search import TraversalTests
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_near
-from warp_abtree.kernels.triangle.float32_filter import (
-    FLOAT32_UNIT,
-    SEPARATED,
-    are_uncertain,
-    intersect_straddling,
-    plane_signs,
-    rotate_corners,
-)
+from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, are_uncertain, intersect_straddling, plane_signs
+from warp_abtree.kernels.triangle.signs import SEPARATED, rotate_corners
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -211,35 +205,22 @@ def corners_of_b(pair: wp.int32):
 
 
 @wp.func
+def corners_at(items: wp.uint64, p: wp.int32, q: wp.int32, r: wp.int32):
+    return wp.matrix_from_rows(corner_at(items, p), corner_at(items, q), corner_at(items, r))
+
+
+@wp.func
 def test_faces_in_place(items: wp.uint64, error: wp.float32, pair: wp.int32, live: bool):
     """Return whether two faces in place meet in float32: 1, 0 or UNCERTAIN; what `float32_filter_triangles` does."""
     a = corners_of_a(pair)
     b = corners_of_b(pair)
-    signs = plane_signs(
-        error,
-        FLOAT32_UNIT,
-        corner_at(items, a),
-        corner_at(items, a + 1),
-        corner_at(items, a + 2),
-        corner_at(items, b),
-        corner_at(items, b + 1),
-        corner_at(items, b + 2),
-    )
+    signs = plane_signs(error, FLOAT32_UNIT, corners_at(items, a, a + 1, a + 2), corners_at(items, b, b + 1, b + 2))
     if signs == SEPARATED or not live:
         return 0
     if are_uncertain(FLOAT32_UNIT, signs):
         return UNCERTAIN
-    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a, a + 1, a + 2, b, b + 1, b + 2)
-    return intersect_straddling(
-        error,
-        FLOAT32_UNIT,
-        corner_at(items, p1),
-        corner_at(items, q1),
-        corner_at(items, r1),
-        corner_at(items, p2),
-        corner_at(items, q2),
-        corner_at(items, r2),
-    )
+    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, wp.vec3i(a, a + 1, a + 2), wp.vec3i(b, b + 1, b + 2))
+    return intersect_straddling(error, FLOAT32_UNIT, corners_at(items, p1, q1, r1), corners_at(items, p2, q2, r2))
 
 
 @wp.func

@@ -15,13 +15,13 @@ from warp_abtree.kernels.exact.predicates import EXACT, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, OUTPUT_FACES, Hits, list_apart, report_hit, test_faces
 from warp_abtree.kernels.search.warp_stack import push_signed_pair, read_signed_pair, signed_pairs
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair
-from warp_abtree.kernels.triangle.float32_filter import SEPARATED, rotate_corners
 from warp_abtree.kernels.triangle.float64_filter import (
     PLANES_UNDECIDED,
     SHARED_CORNER,
     filter_planes,
     filter_straddling,
 )
+from warp_abtree.kernels.triangle.signs import SEPARATED, rotate_corners
 
 RESOLVE_THREADS = RESOLVE_WARPS * WARP_SIZE  # of a block
 MODULE_OPTIONS = native.options(
@@ -53,25 +53,6 @@ def list_apart_item(item: wp.vec3i, apart: bool, hits: Hits):
 
 
 @wp.func
-def resolve_item(
-    mode: wp.int32,
-    output: wp.int32,
-    trees: Trees,
-    pair_poses: wp.array(dtype=PairPose),
-    waits: bool,
-    item: wp.vec3i,
-    hits: Hits,
-):
-    """Decide a face pair if it waits, count and report a hit. For all threads of a warp."""
-    p = item[0]
-    meet = wp.int32(0)
-    if waits and not (output == OUTPUT_ANY and hits.any_hit[p] != 0):
-        meet = test_faces(mode, trees, pair_poses[p], item[1], item[2])
-    report_item(output, pair_poses, item, meet == 1, hits)
-    list_apart_item(item, waits and meet == 0, hits)
-
-
-@wp.func
 def items_at_once(count: wp.int32, threads: wp.int32):
     """Return how many face pairs of a list a warp takes at a time: as many as it has threads, or fewer of a short list.
 
@@ -79,6 +60,35 @@ def items_at_once(count: wp.int32, threads: wp.int32):
     """
     warps = threads / warp_size()
     return wp.clamp((count + warps - 1) / warps, 1, warp_size())
+
+
+@wp.func
+def resolve_list(
+    mode: wp.int32,
+    thread: wp.int32,
+    threads: wp.int32,
+    output: wp.int32,
+    trees: Trees,
+    batch: PairBatch,
+    items: wp.array(dtype=wp.vec3i),
+    end: wp.int32,
+    hits: Hits,
+):
+    """Decide the face pairs of a list, in a grid-stride loop, and count and report hits. For all threads of a warp."""
+    lane = resolve_lane()
+    at_once = items_at_once(end, threads)
+    first = at_once * (thread / warp_size())
+    while first < end:
+        waits = lane < wp.min(at_once, end - first)
+        item, meet = wp.vec3i(), wp.int32(0)
+        if waits:
+            item = items[first + lane]
+        p = item[0]
+        if waits and not (output == OUTPUT_ANY and hits.any_hit[p] != 0):
+            meet = test_faces(mode, trees, batch.poses[p], item[1], item[2])
+        report_item(output, batch.poses, item, meet == 1, hits)
+        list_apart_item(item, waits and meet == 0, hits)
+        first += wp.min(at_once * (threads / warp_size()), end - first)
 
 
 @wp.func
@@ -93,17 +103,8 @@ def defer_inexact(hits: Hits, inexact: bool, item: wp.vec3i):
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=80)
 def resolve_rounded_kernel(threads: wp.int32, output: wp.int32, trees: Trees, batch: PairBatch, hits_inout: Hits):
     """Decide the uncertain face pairs of FLOAT32 by rounded determinants, in a grid-stride loop."""
-    lane = resolve_lane()
     end = wp.min(hits_inout.uncertain_total[0], hits_inout.uncertain.shape[0])
-    at_once = items_at_once(end, threads)
-    first = at_once * (wp.tid() / warp_size())
-    while first < end:
-        waits = lane < wp.min(at_once, end - first)
-        item = wp.vec3i()
-        if waits:
-            item = hits_inout.uncertain[first + lane]
-        resolve_item(FLOAT32, output, trees, batch.poses, waits, item, hits_inout)
-        first += wp.min(at_once * (threads / warp_size()), end - first)
+    resolve_list(FLOAT32, wp.tid(), threads, output, trees, batch, hits_inout.uncertain, end, hits_inout)
 
 
 @wp.func
@@ -120,7 +121,7 @@ def intersect_straddling_item(trees: Trees, pose: PairPose, item: wp.vec3i, sign
     """Return whether straddling faces meet, with the signs of `filter_planes`: 1, 0 or UNCERTAIN."""
     a = load_corner_ids(trees.states, pose.corner_a + item[1])
     b = load_corner_ids(trees.states, pose.corner_b + item[2])
-    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a[0], a[1], a[2], b[0], b[1], b[2])
+    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a, b)
     return filter_straddling(
         load_vertex(trees.models.vertex_pos, p1),
         load_vertex(trees.models.vertex_pos, q1),
@@ -189,14 +190,5 @@ def float64_filter_kernel(threads: wp.int32, output: wp.int32, trees: Trees, bat
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=168)
 def resolve_inexact_kernel(threads: wp.int32, output: wp.int32, trees: Trees, batch: PairBatch, hits_inout: Hits):
     """Decide the inexact face pairs by exact signs, in a grid-stride loop."""
-    lane = resolve_lane()
     end = hits_inout.inexact_total[0]
-    at_once = items_at_once(end, threads)
-    first = at_once * (wp.tid() / warp_size())
-    while first < end:
-        waits = lane < wp.min(at_once, end - first)
-        item = wp.vec3i()
-        if waits:
-            item = hits_inout.inexact[first + lane]
-        resolve_item(EXACT, output, trees, batch.poses, waits, item, hits_inout)
-        first += wp.min(at_once * (threads / warp_size()), end - first)
+    resolve_list(EXACT, wp.tid(), threads, output, trees, batch, hits_inout.inexact, end, hits_inout)

@@ -7,25 +7,13 @@ Source: as `intersect_triangles`. `simd.simd_float64_filter` does the same for 8
 import warp as wp
 
 from warp_abtree.kernels.exact.predicates import FILTER, UNCERTAIN, filter_rows, orient_edges, sum_sizes64
-from warp_abtree.kernels.triangle.float32_filter import SEPARATED, rotate_corners
-from warp_abtree.kernels.triangle.intersect import intersect_triangles, is_one_sided
+from warp_abtree.kernels.triangle.intersect import intersect_triangles
+from warp_abtree.kernels.triangle.signs import SEPARATED, is_one_sided, pack_signs, rotate_corners
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Beside the signs of `plane_signs`: no plane decides, and corners coincide.
 PLANES_UNDECIDED, SHARED_CORNER = wp.constant(-2), wp.constant(1 << 12)
-
-
-@wp.func
-def pack_signs(s0: wp.int32, s1: wp.int32, s2: wp.int32):
-    """Return three signs as two bits each, whether it is positive and whether negative.
-
-    5   4 3   2 1   0
-    [ s0 | s1 | s2 ]    of each: positive, negative
-    """
-    over = wp.where(s0 > 0, 32, 0) | wp.where(s1 > 0, 8, 0) | wp.where(s2 > 0, 2, 0)
-    under = wp.where(s0 < 0, 16, 0) | wp.where(s1 < 0, 4, 0) | wp.where(s2 < 0, 1, 0)
-    return over | under
 
 
 @wp.func
@@ -89,7 +77,7 @@ def float64_filter_triangles(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.ve
         return UNCERTAIN
     if signs == SHARED_CORNER:
         return 1
-    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a0, a1, a2, b0, b1, b2)
+    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, wp.matrix_from_rows(a0, a1, a2), wp.matrix_from_rows(b0, b1, b2))
     return filter_straddling(p1, q1, r1, p2, q2, r2)
 
 

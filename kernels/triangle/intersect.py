@@ -7,60 +7,17 @@ import warp as wp
 from warp_abtree.kernels.base.lanes import lowest_bit
 from warp_abtree.kernels.exact.predicates import EXACT, FILTER, UNCERTAIN, orient3d, orient_edges
 from warp_abtree.kernels.triangle.coplanar import intersect_coplanar, intersect_degenerate, widest_axis
+from warp_abtree.kernels.triangle.signs import (
+    SIGNS_OF_A,
+    SIGNS_OF_B,
+    have_one_side,
+    is_one_sided,
+    pack_sign,
+    pack_signs,
+    rotate_corners,
+)
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
-
-
-@wp.func
-def find_alone(s0: wp.int32, s1: wp.int32, s2: wp.int32):
-    """Return the corner of a triangle that is alone on its closed side of a plane it crosses or touches, and that side.
-
-    The others lie on the other closed side. Where one corner touches and two lie on one side, it is alone on the other.
-    """
-    positive = wp.where(s0 > 0, 1, 0) + wp.where(s1 > 0, 1, 0) + wp.where(s2 > 0, 1, 0)
-    negative = wp.where(s0 < 0, 1, 0) + wp.where(s1 < 0, 1, 0) + wp.where(s2 < 0, 1, 0)
-    # 1, -1 or 0: the sign of which there is one, or none of which is alone but that of a corner that touches.
-    kind = wp.where(positive == 1, 1, wp.where(negative == 1, -1, 0))
-    alone = wp.where(s0 == kind, 0, wp.where(s1 == kind, 1, 2))
-    return alone, wp.where(kind != 0, kind, wp.where(positive == 2, -1, 1))
-
-
-@wp.func
-def rotate_first(i: wp.int32, a: Any, b: Any, c: Any):
-    """Return the corners rotated so that corner i comes first."""
-    first = wp.where(i == 0, a, wp.where(i == 1, b, c))
-    second = wp.where(i == 0, b, wp.where(i == 1, c, a))
-    third = wp.where(i == 0, c, wp.where(i == 1, a, b))
-    return first, second, third
-
-
-@wp.func
-def rotate_triangles(sa: wp.vec3i, sb: wp.vec3i, a0: Any, a1: Any, a2: Any, b0: Any, b1: Any, b2: Any):
-    """Return both triangles, each with the corner first that is alone on its side of the other's plane.
-
-    Each is rotated so that the other's lone corner lies on the positive side of its plane. The planes meet in a line;
-    on it the triangles are the intervals between edges p q and p r, and two more signs order the ends: they meet unless
-    orient_edges(p1, q1, p2, q2) or orient_edges(p1, r1, r2, p2) is 1.
-    """
-    alone_a, side_a = find_alone(sa[0], sa[1], sa[2])
-    alone_b, side_b = find_alone(sb[0], sb[1], sb[2])
-    p1, q1, r1 = rotate_first(alone_a, a0, a1, a2)
-    p2, q2, r2 = rotate_first(alone_b, b0, b1, b2)
-    back_a = side_a < 0
-    back_b = side_b < 0
-    return (
-        p1,
-        wp.where(back_b, r1, q1),
-        wp.where(back_b, q1, r1),
-        p2,
-        wp.where(back_a, r2, q2),
-        wp.where(back_a, q2, r2),
-    )
-
-
-@wp.func
-def is_one_sided(s0: wp.int32, s1: wp.int32, s2: wp.int32):
-    return wp.abs(s0 + s1 + s2) == 3
 
 
 @wp.func(inline=False)
@@ -88,13 +45,8 @@ def pick_corners(k: wp.int32, a0: Any, a1: Any, a2: Any, b0: Any, b1: Any, b2: A
 
 
 @wp.func
-def unpack_sign(signs: wp.int32, k: wp.int32):
-    return ((signs >> (2 * k)) & 3) - 1
-
-
-@wp.func
 def find_signs(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
-    """Return the six exact signs of `intersect_triangles`, 1 added, two bits each; for a coplanar A not all of B's.
+    """Return the word of the six exact signs of `intersect_triangles`; for a coplanar A not all of B's.
 
     Threads of a warp have different signs open: each takes its own next, so that they need not wait for one another.
     """
@@ -106,13 +58,13 @@ def find_signs(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.ve
         if sign == UNCERTAIN:
             pending |= 1 << k
         else:
-            signs |= (sign + 1) << (2 * k)
+            signs |= pack_sign(k, sign)
     while pending != 0:
         k = lowest_bit(pending)
         pending &= pending - 1
         a, b, c, d = pick_corners(k, a0, a1, a2, b0, b1, b2)
-        signs |= (orient3d(EXACT, a, b, c, d) + 1) << (2 * k)
-        if (pending & 7) == 0 and (signs & 63) == 21:
+        signs |= pack_sign(k, orient3d(EXACT, a, b, c, d))
+        if (pending & 7) == 0 and (signs & SIGNS_OF_A) == 0:
             pending = 0  # zeros take longest: not three more of them
     return signs
 
@@ -121,14 +73,13 @@ def find_signs(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.ve
 def intersect_exactly(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
     """Return what `intersect_triangles` does by exact signs, the same for neighbouring threads at the same time."""
     signs = find_signs(a0, a1, a2, b0, b1, b2)
-    sa0, sa1, sa2 = unpack_sign(signs, 0), unpack_sign(signs, 1), unpack_sign(signs, 2)
-    sb0, sb1, sb2 = unpack_sign(signs, 3), unpack_sign(signs, 4), unpack_sign(signs, 5)
-    coplanar_a = sa0 == 0 and sa1 == 0 and sa2 == 0
-    if is_one_sided(sa0, sa1, sa2) or (not coplanar_a and is_one_sided(sb0, sb1, sb2)):
+    special = (signs & SIGNS_OF_A) == 0 or (signs & SIGNS_OF_B) == 0
+    if (signs & SIGNS_OF_A) != 0 and have_one_side(signs):
         return 0
-    if coplanar_a or (sb0 == 0 and sb1 == 0 and sb2 == 0):
+    if special:
         return wp.where(intersect_special(EXACT, a0, a1, a2, b0, b1, b2), 1, 0)
-    p1, q1, r1, p2, q2, r2 = rotate_triangles(wp.vec3i(sa0, sa1, sa2), wp.vec3i(sb0, sb1, sb2), a0, a1, a2, b0, b1, b2)
+    a, b = wp.matrix_from_rows(a0, a1, a2), wp.matrix_from_rows(b0, b1, b2)
+    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a, b)
     first = orient_edges(FILTER, p1, q1, p2, q2)
     second = orient_edges(FILTER, p1, r1, r2, p2)
     while first != 1 and second != 1 and wp.max(first, second) == UNCERTAIN:
@@ -163,7 +114,9 @@ def intersect_triangles(
     special = (sa0 == 0 and sa1 == 0 and sa2 == 0) or (sb0 == 0 and sb1 == 0 and sb2 == 0)
     if special:
         return wp.where(intersect_special(mode, a0, a1, a2, b0, b1, b2), 1, 0)
-    p1, q1, r1, p2, q2, r2 = rotate_triangles(wp.vec3i(sa0, sa1, sa2), wp.vec3i(sb0, sb1, sb2), a0, a1, a2, b0, b1, b2)
+    signs = (pack_signs(sa0, sa1, sa2) << 6) | pack_signs(sb0, sb1, sb2)
+    a, b = wp.matrix_from_rows(a0, a1, a2), wp.matrix_from_rows(b0, b1, b2)
+    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a, b)
     first = orient_edges(mode, p1, q1, p2, q2)
     second = orient_edges(mode, p1, r1, r2, p2)
     return wp.where(first == 1 or second == 1, 0, 1)

@@ -12,7 +12,7 @@ from warp_abtree.kernels.base.lanes import lowest_bit
 from warp_abtree.kernels.exact.expansion import expand_area, expand_volume
 from warp_abtree.kernels.exact.predicates import BOUND_2D, BOUND_3D, EXACT, drop_axis, orient2d, orient3d, plain_sign
 from warp_abtree.kernels.triangle.coplanar import find_ends, widest_axis
-from warp_abtree.kernels.triangle.intersect import find_alone, is_one_sided
+from warp_abtree.kernels.triangle.signs import find_alone, is_one_sided, pack_signs
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -25,91 +25,47 @@ NEAREST_STEPS = wp.constant(32)
 ratios = wp.types.vector(length=9, dtype=wp.float64)  # where each edge of A crosses each of B, along that of A
 
 
-@wp.func
-def round_volume(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
+@native.func_native()
+def round_volume(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec2d:
     """Return det(u, v, w) of three differences as float64 has it, and the sum of magnitudes."""
-    v1w2 = v[1] * w[2]
-    v2w1 = v[2] * w[1]
-    w1u2 = w[1] * u[2]
-    w2u1 = w[2] * u[1]
-    u1v2 = u[1] * v[2]
-    u2v1 = u[2] * v[1]
-    value = (u[0] * (v1w2 - v2w1) + v[0] * (w1u2 - w2u1)) + w[0] * (u1v2 - u2v1)
-    size = wp.abs(u[0]) * (wp.abs(v1w2) + wp.abs(v2w1)) + wp.abs(v[0]) * (wp.abs(w1u2) + wp.abs(w2u1))
-    size = size + wp.abs(w[0]) * (wp.abs(u1v2) + wp.abs(u2v1))
-    return value, size
 
 
 @wp.func
 def signed_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """Return det(a - d, b - d, c - d) with the sign of `orient3d` and a relative error of at most RELATIVE_ERROR."""
-    value, size = round_volume(a - d, b - d, c - d)
-    if BOUND_3D * size > RELATIVE_ERROR * wp.abs(value):
-        value = expand_volume(a, b, c, d)
-    return value
+    value = round_volume(a - d, b - d, c - d)
+    if BOUND_3D * value[1] > RELATIVE_ERROR * wp.abs(value[0]):
+        return expand_volume(a, b, c, d)
+    return value[0]
 
 
-@wp.func
-def round_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
+@native.func_native()
+def round_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d) -> wp.vec2d:
     """Return det(a - c, b - c) as float64 has it, and the sum of magnitudes."""
-    left = (a[0] - c[0]) * (b[1] - c[1])
-    right = (a[1] - c[1]) * (b[0] - c[0])
-    value = left - right
-    return value, wp.abs(left) + wp.abs(right)
 
 
 @wp.func
 def signed_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
     """Return det(a - c, b - c) with the sign of `orient2d` and a relative error of at most RELATIVE_ERROR."""
-    value, size = round_area(a, b, c)
-    if BOUND_2D * size > RELATIVE_ERROR * wp.abs(value):
-        value = expand_area(a, b, c)
-    return value
+    value = round_area(a, b, c)
+    if BOUND_2D * value[1] > RELATIVE_ERROR * wp.abs(value[0]):
+        return expand_area(a, b, c)
+    return value[0]
 
 
 @native.func_native()
-def shares_reciprocal(v: wp.vec3d, s: wp.float64) -> bool:
-    """Return whether `multiply_reciprocal` rounds as a division does."""
+def divide_vector(v: wp.vec3d, s: wp.float64) -> wp.vec3d:
+    """Return v / s, each number rounded once."""
 
 
 @native.func_native()
-def multiply_reciprocal(v: wp.vec3d, s: wp.float64) -> wp.vec3d: ...
-
-
-@wp.func(inline=False)
-def divide_plainly(v: wp.vec3d, s: wp.float64):
-    return v / s
-
-
-@wp.func
-def divide_vector(v: wp.vec3d, s: wp.float64):
-    """Return v / s, each number rounded once. CUDA divides by the one reciprocal where that rounds the same.
-
-    Source: Markstein 1990, Computation of elementary functions on the IBM RISC System/6000 processor, theorem 3.
-    """
-    if shares_reciprocal(v, s):
-        return multiply_reciprocal(v, s)
-    return divide_plainly(v, s)
-
-
-@wp.func
-def measure_length(v: wp.vec3d):
+def measure_length(v: wp.vec3d) -> wp.float64:
     """Return the length of a vector whose squares may underflow or overflow."""
-    m = wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
-    if m == wp.float64(0.0):
-        return m
-    u = divide_vector(v, m)
-    return m * wp.sqrt(wp.dot(u, u))
 
 
-@wp.func
-def unit_vector(v: wp.vec3d):
+@native.func_native()
+def unit_vector(v: wp.vec3d) -> wp.vec3d:
     """Return a vector at length 1, or the zero vector as it is."""
-    m = wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
-    if m == wp.float64(0.0):
-        return v
-    u = divide_vector(v, m)
-    return divide_vector(u, wp.sqrt(wp.dot(u, u)))
 
 
 @wp.func
@@ -123,10 +79,9 @@ def face_normal(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     return unit_vector(n)
 
 
-@wp.func
-def cross_edge(p: wp.vec3d, q: wp.vec3d, value_p: wp.float64, value_q: wp.float64):
+@native.func_native()
+def cross_edge(p: wp.vec3d, q: wp.vec3d, value_p: wp.float64, value_q: wp.float64) -> wp.vec3d:
     """Return the point of edge pq where a linear function of these values, of opposite signs or one 0, vanishes."""
-    return p + (q - p) * (value_p / (value_p - value_q))
 
 
 @wp.func
@@ -142,12 +97,12 @@ def cross_planes(corner: wp.array(dtype=wp.vec3d), volume: wp.array(dtype=wp.flo
     sb = wp.vec3i(plain_sign(volume[3]), plain_sign(volume[4]), plain_sign(volume[5]))
     if is_one_sided(sa[0], sa[1], sa[2]) or is_one_sided(sb[0], sb[1], sb[2]):
         return 0, none, none
-    ap, side_a = find_alone(sa[0], sa[1], sa[2])
-    bp, side_b = find_alone(sb[0], sb[1], sb[2])
-    aq = wp.where(side_b > 0, (ap + 1) % 3, (ap + 2) % 3)
-    ar = wp.where(side_b > 0, (ap + 2) % 3, (ap + 1) % 3)
-    bq = 3 + wp.where(side_a > 0, (bp + 1) % 3, (bp + 2) % 3)
-    br = 3 + wp.where(side_a > 0, (bp + 2) % 3, (bp + 1) % 3)
+    ap, back_a = find_alone(pack_signs(sa[0], sa[1], sa[2]))
+    bp, back_b = find_alone(pack_signs(sb[0], sb[1], sb[2]))
+    aq = wp.where(back_b, (ap + 2) % 3, (ap + 1) % 3)
+    ar = wp.where(back_b, (ap + 1) % 3, (ap + 2) % 3)
+    bq = 3 + wp.where(back_a, (bp + 2) % 3, (bp + 1) % 3)
+    br = 3 + wp.where(back_a, (bp + 1) % 3, (bp + 2) % 3)
     bp = 3 + bp
     # Signs that order X(q) and X(r) (bit 0) against Y(q) and Y(r) (bit 1): 1 where X comes after Y.
     order = wp.vec4i()
@@ -165,7 +120,7 @@ def cross_planes(corner: wp.array(dtype=wp.vec3d), volume: wp.array(dtype=wp.flo
     end = cross_edge(corner[ap], corner[ar], volume[ap], volume[ar])
     if order[1] > 0:
         end = cross_edge(corner[bp], corner[bq], volume[bp], volume[bq])
-    if side_a * side_b < 0:
+    if back_a != back_b:
         return 2, end, start
     return 2, start, end
 
@@ -358,3 +313,31 @@ def intersect_faces(scale: wp.float64, corner: wp.array(dtype=wp.vec3d)):
         p0 = nearest_middle(scale, corner)
         p1 = p0
     return p0, p1, coplanar
+
+
+@native.func_native()
+def find_normal(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, normal: wp.ref[wp.vec3d]) -> bool: ...
+
+
+@wp.func
+def filter_normal(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    """Return `face_normal` without expansions, and whether it is certain."""
+    normal = wp.vec3d()
+    sure = find_normal(a, b, c, normal)
+    return normal, sure
+
+
+@native.func_native()
+def find_segment(proven: bool, a: wp.mat33d, b: wp.mat33d, start: wp.ref[wp.vec3d], end: wp.ref[wp.vec3d]) -> bool: ...
+
+
+@wp.func
+def filter_segment(proven: bool, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
+    """Return the ends of `cross_planes` without expansions or arrays, and whether they are certain.
+
+    Args:
+        proven: Whether the triangles are known to intersect.
+    """
+    start, end = wp.vec3d(), wp.vec3d()
+    sure = find_segment(proven, wp.matrix_from_rows(a0, a1, a2), wp.matrix_from_rows(b0, b1, b2), start, end)
+    return start, end, sure

@@ -7,7 +7,7 @@ from warp_abtree.kernels.base.arrays import ModelPool, StatePool, load_vertex
 from warp_abtree.kernels.base.boxes import round_down_vec, round_up_vec
 from warp_abtree.kernels.base.lanes import block_sync
 from warp_abtree.kernels.base.nodes import Node, empty_node, load_node, store_node
-from warp_abtree.kernels.update.work_lists import UpdateLists
+from warp_abtree.kernels.update.work_lists import UpdateLists, find_update
 
 TOP_THREADS = 512  # of the block that refits the levels next to the root
 MODULE_OPTIONS = native.options("base/lanes.cuh")
@@ -124,13 +124,8 @@ def copy_node_kernel(
     states_inout: StatePool,
 ):
     """Copy the nodes of whole states, given the running total of their counts."""
-    tid = wp.tid()
-    u = wp.lower_bound(node_end, tid + 1)
-    begin = wp.int32(0)
-    if u > 0:
-        begin = node_end[u - 1]
-    source = states_inout.node_start[source_state[u]] + tid - begin
-    target = states_inout.node_start[target_state[u]] + tid - begin
+    u, i = find_update(node_end, node_end.shape[0], wp.tid())
+    source, target = states_inout.node_start[source_state[u]] + i, states_inout.node_start[target_state[u]] + i
     store_node(states_inout, target, load_node(states_inout, source))
 
 
@@ -142,11 +137,6 @@ def copy_face_kernel(
     states_inout: StatePool,
 ):
     """Copy the face corners of whole states, given the running total of their counts."""
-    tid = wp.tid()
-    u = wp.lower_bound(face_end, tid + 1)
-    begin = wp.int32(0)
-    if u > 0:
-        begin = face_end[u - 1]
-    source = states_inout.face_start[source_state[u]] + tid - begin
-    target = states_inout.face_start[target_state[u]] + tid - begin
+    u, i = find_update(face_end, face_end.shape[0], wp.tid())
+    source, target = states_inout.face_start[source_state[u]] + i, states_inout.face_start[target_state[u]] + i
     states_inout.face_corner[target] = states_inout.face_corner[source]

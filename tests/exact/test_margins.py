@@ -19,7 +19,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.exact.predicates import UNCERTAIN
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, side_of_plane
 
-wp.set_module_options(native.options())
+wp.set_module_options(native.options("triangle/float32_filter.cuh"))
 
 U = 2.0**-24
 STILL = np.eye(4)
@@ -187,7 +187,9 @@ SIDES = """
 @wp.kernel
 def side_kernel(points: wp.array2d[wp.vec3], side_out: wp.array[int]):
     i = wp.tid()
-    side_out[i] = side_of_plane(0.0, FLOAT32_UNIT, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
+    side_out[i] = side_of_plane(
+        0.0, FLOAT32_UNIT, wp.matrix_from_rows(points[i, 0], points[i, 1], points[i, 2]), points[i, 3]
+    )
 
 
 def test_the_bound_of_determinants_covers_roundings_that_add_up(device):

@@ -9,28 +9,29 @@ from helpers.questions import launch
 from oracles.signs import COUNT, KINDS, random_floats, rounded_signs, true_signs, true_terms
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.exact.double_word import double_orient2d, double_orient3d
+from warp_abtree.kernels.exact.double_word import add_double, double_orient2d, double_orient3d
 from warp_abtree.kernels.exact.exact import exact_orient2d, exact_orient3d, exact_volume
-from warp_abtree.kernels.exact.expansion import EXPANSION_LANES, expand_area, expand_volume, two_product, two_sum
+from warp_abtree.kernels.exact.expansion import EXPANSION_LANES, expand_area, expand_volume, two_product
 from warp_abtree.kernels.exact.int128 import integer_orient2d, integer_orient3d
 from warp_abtree.kernels.exact.predicates import UNCERTAIN, orient2d, orient3d, orient_edges
-from warp_abtree.kernels.triangle import float32_filter
-from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, add_signs, heights_over_plane, side_of_plane
+from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, gap_signs, plane_signs, side_of_plane
+from warp_abtree.kernels.triangle.signs import SEPARATED, have_one_side
 
-wp.set_module_options(native.options("exact/determinant.cuh", "exact/expansion.cuh"))
+wp.set_module_options(native.options("exact/determinant.cuh", "exact/expansion.cuh", "triangle/float32_filter.cuh"))
 
 
 @wp.kernel
 def words_kernel(a: wp.array[wp.float64], b: wp.array[wp.float64], words_out: wp.array2d[wp.vec2d]):
     """High and low word of a sum, of a product, and of a sum that invites contraction with the product in it."""
-    i = wp.tid()
+    i, zero = wp.tid(), wp.float64(0.0)
     for k in range(3):
-        high, low = two_sum(a[i], b[i])
+        words = add_double(
+            wp.vec2d(wp.where(k == 0, a[i], a[i] * b[i]), zero), wp.vec2d(wp.where(k == 0, b[i], a[i]), zero)
+        )
         if k == 1:
             high, low = two_product(a[i], b[i])
-        if k == 2:
-            high, low = two_sum(a[i] * b[i], a[i])
-        words_out[i, k] = wp.vec2d(high, low)
+            words = wp.vec2d(high, low)
+        words_out[i, k] = words
 
 
 @pytest.mark.parametrize("kind", ["sum", "product", "sum of product"])
@@ -255,20 +256,21 @@ def test_integers_leave_what_is_no_number(device, form):
 def float32_kernel(unit: wp.float32, error: wp.array[wp.float32], points: wp.array2d[wp.vec3], out: wp.array2d[int]):
     """Signs of three points against a plane at once, one by one, and whether all are on one side."""
     i = wp.tid()
-    a, b, c, d, e, f = points[i, 0], points[i, 1], points[i, 2], points[i, 3], points[i, 4], points[i, 5]
-    heights, bound = heights_over_plane(error[i], unit, b - a, c - a, a - d, a - e, a - f)
-    signs = add_signs(0, heights, bound)
+    plane = wp.matrix_from_rows(points[i, 0], points[i, 1], points[i, 2])
+    over = wp.matrix_from_rows(points[i, 3], points[i, 4], points[i, 5])
+    signs = gap_signs(error[i], unit, 2.0**60.0, over, plane)  # all, whatever is on one side
     for k in range(3):
-        pair = (signs >> (4 - 2 * k)) & 3
-        out[i, k] = wp.where(pair == 2, 1, wp.where(pair == 1, -1, wp.where(bound == 0.0, 0, UNCERTAIN)))
-        out[i, 3 + k] = side_of_plane(error[i], unit, a, b, c, points[i, 3 + k])
-    out[i, 6] = float32_filter.one_sided(heights, bound)
+        pair = (signs >> (10 - 2 * k)) & 3
+        out[i, k] = wp.where(pair == 2, 1, wp.where(pair == 1, -1, wp.where(unit == 0.0, 0, UNCERTAIN)))
+        out[i, 3 + k] = side_of_plane(error[i], unit, plane, points[i, 3 + k])
+    out[i, 6] = wp.where(plane_signs(error[i], unit, over, plane) == SEPARATED, 1, 0)
+    out[i, 7] = wp.where(have_one_side(signs), 1, 0)
 
 
 def float32_signs(error, unit, points, device):
     """Return signs (count, 6) of three points against a plane, all at once and one by one; points [count, 6, 3]."""
-    signs = launch(float32_kernel, device, len(points), float(unit), error, points.astype(np.float32), columns=7)
-    np.testing.assert_array_equal(signs[:, 6] < 0, np.abs(signs[:, :3].sum(1)) == 3)
+    signs = launch(float32_kernel, device, len(points), float(unit), error, points.astype(np.float32), columns=8)
+    np.testing.assert_array_equal(signs[:, 6], signs[:, 7])
     return signs[:, :6]
 
 

@@ -19,7 +19,8 @@ from warp_abtree.kernels.intersect.simd import Filtered, simd_float32_filter, si
 from warp_abtree.kernels.search import descent
 from warp_abtree.kernels.search.descent import CPU_STACK_LENGTH, ITEMS_AT_ONCE, WAITING_LENGTH
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
-from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, SEPARATED
+from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT
+from warp_abtree.kernels.triangle.signs import SEPARATED
 
 pytestmark = pytest.mark.slow
 
@@ -30,6 +31,7 @@ wp.set_module_options(
         "search/descend.h",
         "intersect/float32_filter.h",
         "intersect/float64_filter.h",
+        "triangle/float32_filter.cuh",
     )
 )
 

@@ -1,21 +1,28 @@
 // 8 lanes of float64: numbers, masks, points and signs, one of each of 8 face pairs.
 #pragma once
 #include "builtin.h"
+#include "base/points64.cuh"
 
-struct Float64 {
+struct Lanes64 {
     typedef double lanes __attribute__((vector_size(64)));
     typedef wp::int64 bits __attribute__((vector_size(64)));
+    static lanes absolute(const lanes& v) { return __builtin_elementwise_abs(v); }
+    static lanes fuse(const lanes& a, const lanes& b, const lanes& c) { return __builtin_elementwise_fma(a, b, c); }
+    static lanes root(const lanes& v) { return __builtin_elementwise_sqrt(v); }
+    static bits negate(const bits& flags) { return ~flags; }
+    static bool is_all(const bits&) { return false; }  // for a branch that saves nothing here
+    template <class Point>
+    static Point divide(const Point& v, const lanes& s) {
+        return Point{v.x / s, v.y / s, v.z / s};
+    }
+};
+
+struct Float64 : Points64<Lanes64> {
     typedef wp::int64 loose_longs __attribute__((vector_size(64), aligned(8)));
     typedef int ints __attribute__((vector_size(32)));
     typedef int loose_ints __attribute__((vector_size(32), aligned(4)));
     typedef bool flags __attribute__((ext_vector_type(8)));
     typedef double four __attribute__((vector_size(32), aligned(8)));
-    struct Point {
-        lanes x, y, z;
-    };
-    struct Sign {
-        lanes value, size;
-    };
     // Of 8 signs those that are 1, -1 and UNCERTAIN, a bit each.
     struct Sides {
         unsigned int above, below, open;
@@ -26,14 +33,6 @@ struct Float64 {
         unsigned int first, second, back;
     };
 
-    static lanes absolute(const lanes& v) { return __builtin_elementwise_abs(v); }
-    static lanes fuse(const lanes& a, const lanes& b, const lanes& c) { return __builtin_elementwise_fma(a, b, c); }
-    static Point minus(const Point& a, const Point& b) { return Point{a.x - b.x, a.y - b.y, a.z - b.z}; }
-    static Point sizes(const Point& a) { return Point{absolute(a.x), absolute(a.y), absolute(a.z)}; }
-    static lanes sum_sizes(const Point& v) { return (absolute(v.x) + absolute(v.y)) + absolute(v.z); }
-    static Point choose(const bits& which, const Point& a, const Point& b) {
-        return Point{which ? a.x : b.x, which ? a.y : b.y, which ? a.z : b.z};
-    }
     static unsigned int to_mask(const bits& which) {
         return (unsigned int)__builtin_bit_cast(unsigned char, __builtin_convertvector(which, flags));
     }
@@ -56,22 +55,6 @@ struct Float64 {
         return Point{__builtin_shufflevector(low_01, low_23, 0, 1, 4, 5, 8, 9, 12, 13),
                      __builtin_shufflevector(high_01, high_23, 0, 1, 4, 5, 8, 9, 12, 13),
                      __builtin_shufflevector(low_01, low_23, 2, 3, 6, 7, 10, 11, 14, 15)};
-    }
-    // As `filter_rows`, of differences and their magnitudes.
-    static Sign determinant(const Point& u, const Point& v, const Point& w, const Point& u_size, const Point& v_size,
-                            const Point& w_size) {
-        const lanes p = v.z * w.y, q = w.z * u.y, s = u.z * v.y;
-        const lanes x = fuse(v.y, w.z, -p), x_size = fuse(v_size.y, w_size.z, absolute(p));
-        const lanes y = fuse(w.y, u.z, -q), y_size = fuse(w_size.y, u_size.z, absolute(q));
-        const lanes z = fuse(u.y, v.z, -s), z_size = fuse(u_size.y, v_size.z, absolute(s));
-        return Sign{fuse(w.x, z, fuse(v.x, y, u.x * x)),
-                    fuse(w_size.x, z_size, fuse(v_size.x, y_size, u_size.x * x_size))};
-    }
-    // As `filter_edges`, of the differences of ends.
-    static Sign orient_edges(const Point& ac, const Point& ad, const Point& bc, const Point& bd, const Point& cd) {
-        const bits across = sum_sizes(ad) * sum_sizes(bc) < sum_sizes(ac) * sum_sizes(bd);
-        const Point u = choose(across, ad, ac), v = choose(across, bc, bd);
-        return determinant(u, v, cd, sizes(u), sizes(v), sizes(cd));
     }
     static Sides filtered(const lanes& value, const lanes& bound) {
         const unsigned int above = to_mask(value > bound), below = to_mask(value < -bound);

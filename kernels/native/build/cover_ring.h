@@ -47,8 +47,8 @@ inline void fetch_slots(const int* slots, const int* node_of, int* list, int lis
 }
 
 template <class Replay, class Covers>
-wp::int32 cover_ring(const Replay& replay, const Covers& covers, wp::vec_t<3, wp::int32> merge, wp::int32 near_count,
-                     wp::int32 begin, wp::int32 end, wp::float64 limit) {
+wp::int32 cover_ring(const Replay& replay, const Covers& covers, wp::vec3i merge, wp::int32 near_count, wp::int32 begin,
+                     wp::int32 end, wp::float64 limit) {
     if (near_count > NEAR_ROOM)
         return begin;
     PolygonCuts cuts;

@@ -2,112 +2,49 @@
 #pragma once
 #include "builtin.h"
 #include "base/sizes.h"
-#include "contacts/double64.h"
+#include "base/float64.h"
+#include "triangle/segment.cuh"
 
-struct Contact64 {
+struct Contact64 : SharedSegment<Lanes64> {
     typedef Float64 F;
-    typedef Double64 D;
-    typedef F::lanes lanes;
-    typedef F::bits bits;
-    typedef F::Point Point;
-
-    // Ends of edges in order, as `order_ends` says: 1 and -1.
-    struct Order {
-        bits after, before;
-    };
 
     static Point negate(const Point& v) { return Point{-v.x, -v.y, -v.z}; }
-    static lanes dot(const Point& a, const Point& b) { return (a.x * b.x + a.y * b.y) + a.z * b.z; }
-    static lanes largest(const Point& v) {
-        const lanes x = F::absolute(v.x), y = F::absolute(v.y), z = F::absolute(v.z);
-        const lanes m = x >= y ? x : y;
-        return m >= z ? m : z;
-    }
-    static Point divide(const Point& v, const lanes& s) { return Point{v.x / s, v.y / s, v.z / s}; }
-    static lanes root(const lanes& x) { return __builtin_elementwise_sqrt(x); }
-    static lanes measure_length(const Point& v) {
-        const lanes m = largest(v);
-        const Point u = divide(v, m);
-        return m == 0.0 ? m : m * root(dot(u, u));
-    }
-    static Point unit_vector(const Point& v) {
-        const lanes m = largest(v);
-        const Point u = divide(v, m);
-        return F::choose(m == 0.0, v, divide(u, root(dot(u, u))));
-    }
     // By columns, as Warp multiplies.
     static Point turn(const double (&m)[3][3], const Point& v) {
         return Point{(m[0][0] * v.x + m[0][1] * v.y) + m[0][2] * v.z, (m[1][0] * v.x + m[1][1] * v.y) + m[1][2] * v.z,
                      (m[2][0] * v.x + m[2][1] * v.y) + m[2][2] * v.z};
     }
-    static Point pose(const double (&m)[3][3], const wp::vec_t<3, wp::float64>& t, const Point& p) {
+    static Point pose(const double (&m)[3][3], const wp::vec3d& t, const Point& p) {
         const Point v = turn(m, p);
         const lanes x = v.x + t[0], y = v.y + t[1], z = v.z + t[2];
         return Point{F::absolute(x) < COORDINATE_MIN ? lanes{} : x, F::absolute(y) < COORDINATE_MIN ? lanes{} : y,
                      F::absolute(z) < COORDINATE_MIN ? lanes{} : z};
     }
-    // As `round_volume`, of differences, and the sum of magnitudes.
-    static lanes volume(const Point& u, const Point& v, const Point& w, lanes& size) {
-        const lanes v1w2 = v.y * w.z, v2w1 = v.z * w.y, w1u2 = w.y * u.z, w2u1 = w.z * u.y;
-        const lanes u1v2 = u.y * v.z, u2v1 = u.z * v.y;
-        size = F::absolute(u.x) * (F::absolute(v1w2) + F::absolute(v2w1));
-        size = size + F::absolute(v.x) * (F::absolute(w1u2) + F::absolute(w2u1));
-        size = size + F::absolute(w.x) * (F::absolute(u1v2) + F::absolute(u2v1));
-        return (u.x * (v1w2 - v2w1) + v.x * (w1u2 - w2u1)) + w.x * (u1v2 - u2v1);
-    }
-    // As `filter_volumes`, or without double words where it does not extend: of triangle (a, b, c) and d, with u, v and
-    // w their differences, perhaps all turned round. Adds the lanes that it is not sure of to a mask.
+    // Without double words where it does not extend: of triangle c and d, with u, v and w their differences, perhaps
+    // all turned round. Adds the lanes that it is not sure of to a mask.
     static lanes filter_volume(bool extends, const Point (&c)[3], const Point& d, const Point& u, const Point& v,
                                const Point& w, bits& unsure) {
-        lanes size, value = volume(u, v, w, size);
-        bits open = BOUND_3D * size > RELATIVE_ERROR * F::absolute(value);
+        Sign x = F::volume(u, v, w);
+        bits open = errs(BOUND_3D, x);
         if (__builtin_expect(extends && F::to_mask(open) != 0, 0))
-            value = D::round(D::orient3d(c[0], c[1], c[2], d), BOUND_DOUBLE * size, value, open);
+            round(Words::orient3d(c[0], c[1], c[2], d), BOUND_DOUBLE * x.size, x.value, open);
         unsure |= open;
-        return value;
+        return x.value;
     }
-    // As `filter_normal`, in the same way.
+    // In the same way.
     static lanes filter_area(bool extends, const lanes& ax, const lanes& ay, const lanes& bx, const lanes& by,
                              const lanes& cx, const lanes& cy, bits& unsure) {
-        const lanes left = (ax - cx) * (by - cy), right = (ay - cy) * (bx - cx);
-        const lanes size = F::absolute(left) + F::absolute(right);
-        lanes value = left - right;
-        bits open = BOUND_2D * size > RELATIVE_ERROR * F::absolute(value);
+        Sign x = F::area(ax, ay, bx, by, cx, cy);
+        bits open = errs(BOUND_2D, x);
         if (__builtin_expect(extends && F::to_mask(open) != 0, 0))
-            value = D::round(D::orient2d(ax, ay, bx, by, cx, cy), BOUND_DOUBLE * size, value, open);
+            round(Words::orient2d(ax, ay, bx, by, cx, cy), BOUND_DOUBLE * x.size, x.value, open);
         unsure |= open;
-        return value;
+        return x.value;
     }
     static Point filter_normal(bool extends, const Point& a, const Point& b, const Point& c, bits& unsure) {
         return unit_vector(Point{filter_area(extends, a.y, a.z, b.y, b.z, c.y, c.z, unsure),
                                  filter_area(extends, a.z, a.x, b.z, b.x, c.z, c.x, unsure),
                                  filter_area(extends, a.x, a.y, b.x, b.y, c.x, c.y, unsure)});
-    }
-    static Order order_ends(const Point& p1, const Point& e1, const Point& p2, const Point& e2, bits& open) {
-        const Point u = F::minus(p1, e2), v = F::minus(e1, e2), w = F::minus(p2, e2);
-        const F::Sign sign = F::determinant(u, v, w, F::sizes(u), F::sizes(v), F::sizes(w));
-        const lanes bound = BOUND_3D * sign.size;
-        const Order order = {sign.value > bound, sign.value < -bound};
-        open |= ~(order.after | order.before) & (bound != 0.0);
-        return order;
-    }
-    // As `rotate_triangles`: corners and their volumes from the lone one on, in either direction.
-    static void rotate(const bits& first, const bits& second, const bits& back, const Point (&c)[3],
-                       const lanes (&x)[3], Point& p, Point& q, Point& r, lanes& of_p, lanes& of_q, lanes& of_r) {
-        p = F::choose(first, c[0], F::choose(second, c[1], c[2]));
-        of_p = first ? x[0] : second ? x[1] : x[2];
-        const Point next = F::choose(first, c[1], F::choose(second, c[2], c[0]));
-        const Point last = F::choose(first, c[2], F::choose(second, c[0], c[1]));
-        const lanes of_next = first ? x[1] : second ? x[2] : x[0], of_last = first ? x[2] : second ? x[0] : x[1];
-        q = F::choose(back, last, next);
-        r = F::choose(back, next, last);
-        of_q = back ? of_last : of_next;
-        of_r = back ? of_next : of_last;
-    }
-    static Point cross_edge(const Point& p, const Point& q, const lanes& value_p, const lanes& value_q) {
-        const lanes part = value_p / (value_p - value_q);
-        const Point way = F::minus(q, p);
-        return Point{p.x + way.x * part, p.y + way.y * part, p.z + way.z * part};
     }
     static Point blend_normals(const Point& normal_a, const Point& normal_b) {
         const Point normal = F::minus(normal_a, normal_b);

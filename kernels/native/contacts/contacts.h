@@ -13,21 +13,21 @@ struct ContactFinder {
     typedef F::Point Point;
     const PairPose& pose;
     const Contacts& contacts;
-    const wp::mat_t<3, 3, wp::float64>& rotation;
-    const wp::vec_t<3, wp::float64>& position;
-    const wp::vec_t<3, wp::int32>* faces;
+    const wp::mat33d& rotation;
+    const wp::vec3d& position;
+    const wp::vec3i* faces;
     const double* vertices;
-    const wp::vec_t<4, wp::int32>* corners;
+    const wp::vec4i* corners;
     bool proven, with_gap, back;
-    wp::vec_t<3, wp::float64>* target[5];
+    wp::vec3d* target[5];
 
     // Corners of so many face pairs, in A's frame.
     void load(const int* hit, int count, Point (&a)[3], Point (&b)[3]) const {
         int start[6][8];
         for (int k = 0; k < 8; ++k) {
-            const wp::vec_t<3, wp::int32>& pair = faces[hit[k < count ? k : 0]];
-            const wp::vec_t<4, wp::int32>& a = corners[pose.corner_a + pair[back ? 2 : 1]];
-            const wp::vec_t<4, wp::int32>& b = corners[pose.corner_b + pair[back ? 1 : 2]];
+            const wp::vec3i& pair = faces[hit[k < count ? k : 0]];
+            const wp::vec4i& a = corners[pose.corner_a + pair[back ? 2 : 1]];
+            const wp::vec4i& b = corners[pose.corner_b + pair[back ? 1 : 2]];
             for (int i = 0; i < 3; ++i) {
                 start[i][k] = 4 * a[i];
                 start[3 + i][k] = 4 * b[i];
@@ -95,43 +95,19 @@ struct ContactFinder {
         const Point own_a = C::filter_normal(extends, a[0], a[1], a[2], open);
         const Point own_b = C::filter_normal(extends, b[0], b[1], b[2], open);
         lanes u[3], v[3];
-        bits up_a[3], up_b[3];
         for (int i = 0; i < 3; ++i) {
             u[i] = C::filter_volume(extends, b, a[i], d[i][0], d[i][1], d[i][2], open);
             v[i] = C::filter_volume(extends, a, b[i], C::negate(d[0][i]), C::negate(d[1][i]), C::negate(d[2][i]), open);
-            up_a[i] = u[i] > 0.0;
-            up_b[i] = v[i] > 0.0;
-            open |= (u[i] == 0.0) | (v[i] == 0.0);
         }
-        // All corners of either on one side: as a coarser precision can report them.
-        open |= ~(up_a[0] ^ up_a[1]) & ~(up_a[1] ^ up_a[2]);
-        open |= ~(up_b[0] ^ up_b[1]) & ~(up_b[1] ^ up_b[2]);
-        // As `rotate_triangles` where no corner touches: p the lone corner, then q and r.
-        const bits first_a = (up_a[0] ^ up_a[1]) & ~(up_a[1] ^ up_a[2]);
-        const bits second_a = (up_a[0] ^ up_a[1]) & (up_a[1] ^ up_a[2]);
-        const bits first_b = (up_b[0] ^ up_b[1]) & ~(up_b[1] ^ up_b[2]);
-        const bits second_b = (up_b[0] ^ up_b[1]) & (up_b[1] ^ up_b[2]);
-        const bits below_a = ~(first_a ? up_a[0] : second_a ? up_a[1] : up_a[2]);
-        const bits below_b = ~(first_b ? up_b[0] : second_b ? up_b[1] : up_b[2]);
-        Point pa, qa, ra, pb, qb, rb;
-        lanes up, uq, ur, vp, vq, vr;
-        C::rotate(first_a, second_a, below_b, a, u, pa, qa, ra, up, uq, ur);
-        C::rotate(first_b, second_b, below_a, b, v, pb, qb, rb, vp, vq, vr);
-        // Of X(q), X(r) on A's edges against Y(q), Y(r) on B's; that the other two are in order is why faces meet.
-        const bits qr = C::order_ends(pa, qa, pb, rb, open).after, rq = C::order_ends(pa, ra, pb, qb, open).after;
-        if (!proven) {
-            open |= C::order_ends(pa, qa, pb, qb, open).after;
-            open |= C::order_ends(pa, ra, pb, rb, open).before;
-        }
-        Point p0 = C::cross_edge(F::choose(qr, pa, pb), F::choose(qr, qa, rb), qr ? up : vp, qr ? uq : vr);
-        Point p1 = C::cross_edge(F::choose(rq, pb, pa), F::choose(rq, qb, ra), rq ? vp : up, rq ? vq : ur);
+        Point p0, p1;
+        const bits back_to_front = C::find_ends(proven, a, b, u, v, p0, p1, open);
         p0 = C::pose(rotation.data, position, p0);
         p1 = C::pose(rotation.data, position, p1);
         const Point normal_a = C::unit_vector(C::turn(rotation.data, own_a));
         const Point normal_b = C::unit_vector(C::turn(rotation.data, own_b));
         const Point normal = C::blend_normals(normal_a, normal_b);
         // Segments run the other way for one of two orders of the lone corners' sides, and of the objects.
-        const bits turned = (below_a ^ below_b) ^ (bits{} - (wp::int64)back);
+        const bits turned = back_to_front ^ (bits{} - (wp::int64)back);
         store(hit, count,
               {F::choose(turned, p1, p0), F::choose(turned, p0, p1), back ? normal_b : normal_a,
                back ? normal_a : normal_b, back ? C::negate(normal) : normal});
@@ -140,9 +116,8 @@ struct ContactFinder {
 };
 
 template <class ModelPool, class StatePool, class PairPose, class Contacts>
-wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const PairPose& pose,
-                        wp::mat_t<3, 3, wp::float64> rotation, wp::vec_t<3, wp::float64> position, bool proven,
-                        wp::vec_t<3, wp::int32> span, wp::array_t<wp::vec_t<3, wp::int32>> faces,
+wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const PairPose& pose, wp::mat33d rotation,
+                        wp::vec3d position, bool proven, wp::vec3i span, wp::array_t<wp::vec3i> faces,
                         wp::array_t<wp::int32> place, const Contacts& contacts) {
 #pragma clang fp contract(off)
     const bool with_gap = contacts.separation.shape[0] != 0;

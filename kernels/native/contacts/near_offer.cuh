@@ -106,8 +106,8 @@ struct NearOffer {
         return scores;
     }
     // Puts the scores of a lane into the slots of its object pair: of what is inside the deepest alone.
-    static CUDA_CALLABLE void put(const Scores& scores, int lane, const wp::vec_t<2, wp::int32>& widths, int face_a,
-                                  int face_b, wp::int64* slots) {
+    static CUDA_CALLABLE void put(const Scores& scores, int lane, const wp::vec2i& widths, int face_a, int face_b,
+                                  wp::int64* slots) {
         const unsigned long long name = ((unsigned long long)face_a << widths[1]) | (unsigned int)face_b;
         const int width = widths[0] + widths[1];
 #if defined(__CUDA_ARCH__)
@@ -127,17 +127,9 @@ struct NearOffer {
     }
 };
 
-// The corners of one face, in rows, in all lanes.
-template <class Rows>
-CUDA_CALLABLE void spread_corners(const Rows& rows, Float32::Point (&corners)[3]) {
-    const Float32::lanes zero = {};
-    for (int k = 0; k < 3; ++k)
-        corners[k] = Float32::Point{zero + rows.data[k][0], zero + rows.data[k][1], zero + rows.data[k][2]};
-}
-
 template <class Corners>
 CUDA_CALLABLE void offer_faces(const Corners& a, const Corners& b, wp::float32 gap, wp::float32 weight,
-                               wp::array_t<wp::float32> directions, wp::vec_t<2, wp::int32> widths, wp::int32 face_a,
+                               wp::array_t<wp::float32> directions, wp::vec2i widths, wp::int32 face_a,
                                wp::int32 face_b, wp::int32 pair, wp::array_t<wp::int64> slots) {
     typedef NearOffer O;
     O::N::Corners c;

@@ -6,12 +6,11 @@
 
 template <class ModelPool, class StatePool, class PairPose>
 void simd_offer_faces(const ModelPool& models, const StatePool& states, const PairPose& pose, wp::int32 count,
-                      wp::array_t<wp::int64> faces, wp::vec_t<2, wp::float32> bounds,
-                      wp::array_t<wp::float32> directions, wp::vec_t<2, wp::int32> widths, wp::int32 pair,
-                      wp::array_t<wp::int64> slots) {
+                      wp::array_t<wp::int64> faces, wp::vec2 bounds, wp::array_t<wp::float32> directions,
+                      wp::vec2i widths, wp::int32 pair, wp::array_t<wp::int64> slots) {
     typedef NearOffer O;
     const float scale = (float)pose.scale;
-    wp::vec_t<3, float> there;
+    wp::vec3 there;
     for (int i = 0; i < 3; ++i)
         there[i] = pose.translation32[i] * scale;
     wp::int64* const own = slots.data + (wp::int64)pair * SLOT_ROOM;

@@ -92,15 +92,14 @@ inline CUDA_CALLABLE void put_into_slots(wp::int64* slots, const float* scores, 
 
 typedef SlotScores<float, bool, int> PointScores;
 
-inline CUDA_CALLABLE wp::int32 find_bin(wp::vec_t<3, wp::float32> normal, wp::array_t<wp::float32> directions) {
+inline CUDA_CALLABLE wp::int32 find_bin(wp::vec3 normal, wp::array_t<wp::float32> directions) {
     return PointScores::find_bin({normal[0], normal[1], normal[2]}, directions.data);
 }
 
 inline CUDA_CALLABLE wp::vec_t<SCORES, wp::float32> no_scores() { return wp::vec_t<SCORES, wp::float32>(NO_SCORE); }
 
-inline CUDA_CALLABLE void rate_point(wp::vec_t<3, wp::float32> point, wp::float32 separation, wp::float32 weight,
-                                     wp::int32 bin, wp::array_t<wp::float32> directions,
-                                     wp::vec_t<SCORES, wp::float32>& scores) {
+inline CUDA_CALLABLE void rate_point(wp::vec3 point, wp::float32 separation, wp::float32 weight, wp::int32 bin,
+                                     wp::array_t<wp::float32> directions, wp::vec_t<SCORES, wp::float32>& scores) {
     PointScores own(bin, directions.data);
     own.offer(weight, {point[0], point[1], point[2]}, separation, true);
     for (int k = 0; k < SCORES; ++k)

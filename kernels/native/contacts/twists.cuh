@@ -37,11 +37,11 @@ struct TwistChoice {
         lanes separation;
     };
     static constexpr float RIM = 0.95f;
-    const wp::vec_t<4, float>* wrenches;
+    const wp::vec4* wrenches;
     int first, end;
 
     CUDA_CALLABLE Wrench get(int c) const {
-        const wp::vec_t<4, float>&n = wrenches[2 * c], &m = wrenches[2 * c + 1];
+        const wp::vec4 &n = wrenches[2 * c], &m = wrenches[2 * c + 1];
         const lanes zero = {};
         return Wrench{{zero + n[0], zero + n[1], zero + n[2]}, {zero + m[0], zero + m[1], zero + m[2]}, zero + n[3]};
     }
@@ -101,9 +101,9 @@ struct TwistChoice {
 };
 
 template <class Array>
-CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec_t<4, wp::float32>> wrenches, wp::int32 first,
-                                         wp::int32 end, wp::array_t<wp::float32> twists, wp::float32 limit,
-                                         wp::float32 tolerance, wp::float32 deep, wp::int32 most, Array chosen) {
+CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec4> wrenches, wp::int32 first, wp::int32 end,
+                                         wp::array_t<wp::float32> twists, wp::float32 limit, wp::float32 tolerance,
+                                         wp::float32 deep, wp::int32 most, Array chosen) {
     typedef TwistChoice T;
     const T choice = {wrenches.data, first, end};
     // The nearest candidate, the first of several, which must be among those chosen or about as near as one; and that
@@ -116,9 +116,9 @@ CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec_t<4, wp::float32>> 
             nearest_at = k;
         }
     find_greatest(nearest, nearest_at);
-    const wp::vec_t<4, float>& own = wrenches.data[2 * nearest_at];
+    const wp::vec4& own = wrenches.data[2 * nearest_at];
     for (int k = first + group_lane(); k < end; k += group_size()) {
-        const wp::vec_t<4, float>& n = wrenches.data[2 * k];
+        const wp::vec4& n = wrenches.data[2 * k];
         const float other = -Float32::fuse(own[0], n[0], Float32::fuse(own[1], n[1], own[2] * n[2]));
         if (other > against) {
             against = other;
@@ -137,7 +137,7 @@ CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec_t<4, wp::float32>> 
         twist[g].angular = T::Point{x[3], x[4], x[5]};
         if (number >= RANDOM_TWISTS) {
             const int turns = RANDOM_TWISTS + (TWIST_COUNT - RANDOM_TWISTS) / 2;
-            const wp::vec_t<4, float>& n = wrenches.data[2 * (number < turns ? nearest_at : against_at)];
+            const wp::vec4& n = wrenches.data[2 * (number < turns ? nearest_at : against_at)];
             choice.tilt(twist[g], {n[0], n[1], n[2]});
         }
         twist[g].stop = zero + limit;

@@ -25,9 +25,8 @@ struct NearBoxes : SlabBounds {
     wp::int64 slabs;  // where the slab of a node lies, from the node; 0 for none
     bool normals;     // whether slabs are compared along the nodes' own normals
 
-    static NearBoxes make(const wp::float32 (&r)[3][3], const wp::vec_t<3, float>& back,
-                          const wp::vec_t<3, float>& there, float margin, float scale, const void* trees, int a,
-                          int b) {
+    static NearBoxes make(const wp::float32 (&r)[3][3], const wp::vec3& back, const wp::vec3& there, float margin,
+                          float scale, const void* trees, int a, int b) {
         NearBoxes s;
         auto join = [](float a, float b) { return lanes{a, a, a, a, a, a, a, a, b, b, b, b, b, b, b, b}; };
         for (int i = 0; i < 3; ++i) {

@@ -33,7 +33,7 @@ struct NearestMemory {
         return m;
     }
     // Under which a pair of faces matters, as `cut_of`.
-    static float cut_of(float upper, const wp::vec_t<4, float>& terms) {
+    static float cut_of(float upper, const wp::vec4& terms) {
         const float part = terms[1] * upper - terms[2], more = part > terms[0] ? part : terms[0];
         const float off = more - terms[3] * upper;
         return off > 0.0f ? upper - off : upper;

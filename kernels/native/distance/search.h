@@ -10,7 +10,7 @@ struct NearestLimits {
     float limit, soon;
 
     template <class SearchScale>
-    void set(const NearestMemory::Header& h, const wp::vec_t<4, wp::float32>& terms, const SearchScale& scaling) {
+    void set(const NearestMemory::Header& h, const wp::vec4& terms, const SearchScale& scaling) {
         constexpr float PART[] = {0.6f, 0.85f, 1.0f};
         const float cut = h.found ? NearestMemory::cut_of(h.upper, terms) : h.upper;
         auto to_bound = [&](float x) {
@@ -25,7 +25,7 @@ struct NearestLimits {
 // Measure up to 16 pairs of faces in float32: those that may be nearest wait for float64.
 template <class ModelPool, class StatePool, class PairPose, class SearchScale>
 void measure_faces(const ModelPool& models, const StatePool& states, const PairPose& pose, const SearchScale& scaling,
-                   const wp::vec_t<4, wp::float32>& terms, const NearestMemory& m, const wp::int64* items, int count,
+                   const wp::vec4& terms, const NearestMemory& m, const wp::int64* items, int count,
                    NearestLimits& limits) {
     typedef NearestFaces N;
     typedef N::F F;
@@ -55,7 +55,7 @@ void measure_faces(const ModelPool& models, const StatePool& states, const PairP
 
 template <class ModelPool, class StatePool, class PairPose, class SearchScale, class Slabs, class PairTests>
 bool search_nearest(const ModelPool& models, const StatePool& states, const PairPose& pose, const SearchScale& scaling,
-                    wp::vec_t<4, wp::float32> terms, const Slabs& slabs, bool with_slabs, wp::int32 thread,
+                    wp::vec4 terms, const Slabs& slabs, bool with_slabs, wp::int32 thread,
                     wp::array_t<wp::float32> memory, PairTests& tests) {
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;

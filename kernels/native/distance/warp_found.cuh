@@ -2,19 +2,18 @@
 #pragma once
 #include "builtin.h"
 
-inline CUDA_CALLABLE wp::vec_t<2, wp::float32> load_upper(wp::array_t<wp::vec_t<2, wp::float32>> upper, wp::int32 i) {
+inline CUDA_CALLABLE wp::vec2 load_upper(wp::array_t<wp::vec2> upper, wp::int32 i) {
 #if defined(__CUDA_ARCH__)
     // Lanes that were not together read at different times; what follows needs the same numbers in all.
     const unsigned long long both = *(const volatile unsigned long long*)(upper.data + i);
     const unsigned long long x = __shfl_sync(0xffffffffu, both, 0);
-    return wp::vec_t<2, wp::float32>(__int_as_float((int)x), __int_as_float((int)(x >> 32)));
+    return wp::vec2(__int_as_float((int)x), __int_as_float((int)(x >> 32)));
 #else
     return upper.data[i];
 #endif
 }
 
-inline CUDA_CALLABLE void lower_upper(wp::array_t<wp::vec_t<2, wp::float32>> upper, wp::int32 i, wp::int32 k,
-                                      wp::float32 x) {
+inline CUDA_CALLABLE void lower_upper(wp::array_t<wp::vec2> upper, wp::int32 i, wp::int32 k, wp::float32 x) {
 #if defined(__CUDA_ARCH__)
     // Numbers of 0 and more are in the order of their bits.
     if (threadIdx.x == 0)

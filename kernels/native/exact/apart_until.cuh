@@ -4,9 +4,8 @@
 #include "exact/moving_faces.h"
 
 template <class FirstContact>
-CUDA_CALLABLE void apart_until(wp::mat_t<6, 6, wp::float64> starts, wp::mat_t<6, 6, wp::float64> ends,
-                               wp::vec_t<3, wp::float64> away, wp::float64 error, wp::float64 start, wp::float64 limit,
-                               FirstContact& contact) {
+CUDA_CALLABLE void apart_until(wp::mat_t<6, 6, wp::float64> starts, wp::mat_t<6, 6, wp::float64> ends, wp::vec3d away,
+                               wp::float64 error, wp::float64 start, wp::float64 limit, FirstContact& contact) {
     MovingFaces faces(starts.data, ends.data, error);
     // At time 0 nothing says that they are apart: they are if B's face comes there and meets nothing on that way.
     if (start == 0.0) {

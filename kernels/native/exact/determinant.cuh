@@ -3,11 +3,11 @@
 #pragma once
 #include "builtin.h"
 #include "base/sizes.h"
+#include "exact/double_word.cuh"
 #include "exact/wide_integer.h"
 #include "exact/word_sum.h"
 
-inline CUDA_CALLABLE wp::float64 exact_volume(wp::vec_t<3, wp::float64> a, wp::vec_t<3, wp::float64> b,
-                                              wp::vec_t<3, wp::float64> c, wp::vec_t<3, wp::float64> d) {
+inline CUDA_CALLABLE wp::float64 exact_volume(wp::vec3d a, wp::vec3d b, wp::vec3d c, wp::vec3d d) {
     typedef WideInteger Wide;
     // High and low word of each difference: six products of three, each of eight combinations.
     double part[3][3][2];
@@ -45,9 +45,7 @@ inline CUDA_CALLABLE wp::float64 exact_volume(wp::vec_t<3, wp::float64> a, wp::v
     return sum.round(lowest - 3 * 1075);
 }
 
-inline CUDA_CALLABLE wp::int32 integer_orient3d(wp::vec_t<3, wp::float64> a, wp::vec_t<3, wp::float64> b,
-                                                wp::vec_t<3, wp::float64> c, wp::vec_t<3, wp::float64> d,
-                                                wp::float64 bound) {
+inline CUDA_CALLABLE wp::int32 integer_orient3d(wp::vec3d a, wp::vec3d b, wp::vec3d c, wp::vec3d d, wp::float64 bound) {
     typedef WideInteger Wide;
     const int top = Wide::exponent_of(bound);
     if (top == 2047)
@@ -81,8 +79,7 @@ inline CUDA_CALLABLE wp::int32 integer_orient3d(wp::vec_t<3, wp::float64> a, wp:
     return Wide::sign_of(Wide::add(Wide::add(first, second), third));
 }
 
-inline CUDA_CALLABLE wp::int32 integer_orient2d(wp::vec_t<2, wp::float64> a, wp::vec_t<2, wp::float64> b,
-                                                wp::vec_t<2, wp::float64> c, wp::float64 bound) {
+inline CUDA_CALLABLE wp::int32 integer_orient2d(wp::vec2d a, wp::vec2d b, wp::vec2d c, wp::float64 bound) {
     typedef WideInteger Wide;
     const int top = Wide::exponent_of(bound);
     if (top == 2047)

@@ -4,8 +4,7 @@
 #include "exact/expansion_sum.h"
 #include "base/sizes.h"
 
-inline CUDA_CALLABLE wp::float64 sum_volume(wp::vec_t<3, wp::float64> a, wp::vec_t<3, wp::float64> b,
-                                            wp::vec_t<3, wp::float64> c, wp::vec_t<3, wp::float64> d) {
+inline CUDA_CALLABLE wp::float64 sum_volume(wp::vec3d a, wp::vec3d b, wp::vec3d c, wp::vec3d d) {
 #if defined(__CUDA_ARCH__)
     // Of odd length, so that lanes at the same component take different banks.
     __shared__ double rows[EXPANSION_LANES][EXPANSION_LENGTH + 1];
@@ -14,34 +13,34 @@ inline CUDA_CALLABLE wp::float64 sum_volume(wp::vec_t<3, wp::float64> a, wp::vec
     double row[EXPANSION_LENGTH];
     ExpansionSum sum = {row, 0};
 #endif
-    double u[3], v[3], w[3], u_low[3], v_low[3], w_low[3];
+    DoubleWord u[3], v[3], w[3];
     for (int i = 0; i < 3; ++i) {
-        u[i] = ExpansionSum::add_exactly(a[i], -d[i], u_low[i]);
-        v[i] = ExpansionSum::add_exactly(b[i], -d[i], v_low[i]);
-        w[i] = ExpansionSum::add_exactly(c[i], -d[i], w_low[i]);
+        u[i] = DoubleWord::add_exactly(a[i], -d[i]);
+        v[i] = DoubleWord::add_exactly(b[i], -d[i]);
+        w[i] = DoubleWord::add_exactly(c[i], -d[i]);
     }
     // Bits of a term: the words, then whether the permutation is odd, then the axis of u.
     for (int term = 0; term < 48; ++term) {
         const int i = term >> 4, odd = (term >> 3) & 1, j = (i + 1 + odd) % 3, k = (i + 2 - odd) % 3;
-        const double x = (term & 1) != 0 ? u_low[i] : u[i];
-        sum.add_product(odd != 0 ? -x : x, (term & 2) != 0 ? v_low[j] : v[j], (term & 4) != 0 ? w_low[k] : w[k]);
+        const double x = (term & 1) != 0 ? u[i].low : u[i].high;
+        sum.add_product(odd != 0 ? -x : x, (term & 2) != 0 ? v[j].low : v[j].high,
+                        (term & 4) != 0 ? w[k].low : w[k].high);
     }
     return sum.value();
 }
 
-inline CUDA_CALLABLE wp::float64 sum_area(wp::vec_t<2, wp::float64> a, wp::vec_t<2, wp::float64> b,
-                                          wp::vec_t<2, wp::float64> c) {
+inline CUDA_CALLABLE wp::float64 sum_area(wp::vec2d a, wp::vec2d b, wp::vec2d c) {
     double row[16];  // products of two: eight of two words, and their zeros
     ExpansionSum sum = {row, 0};
-    double u[2], v[2], u_low[2], v_low[2];
+    DoubleWord u[2], v[2];
     for (int i = 0; i < 2; ++i) {
-        u[i] = ExpansionSum::add_exactly(a[i], -c[i], u_low[i]);
-        v[i] = ExpansionSum::add_exactly(b[i], -c[i], v_low[i]);
+        u[i] = DoubleWord::add_exactly(a[i], -c[i]);
+        v[i] = DoubleWord::add_exactly(b[i], -c[i]);
     }
     for (int term = 0; term < 8; ++term) {
         const int i = term >> 2;
-        const double x = (term & 1) != 0 ? u_low[i] : u[i];
-        sum.add_product(i != 0 ? -x : x, (term & 2) != 0 ? v_low[1 - i] : v[1 - i], 1.0);
+        const double x = (term & 1) != 0 ? u[i].low : u[i].high;
+        sum.add_product(i != 0 ? -x : x, (term & 2) != 0 ? v[1 - i].low : v[1 - i].high, 1.0);
     }
     return sum.value();
 }

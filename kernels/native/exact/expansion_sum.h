@@ -2,25 +2,21 @@
 // Source: Shewchuk 1997, Adaptive precision floating-point arithmetic and fast robust geometric predicates.
 #pragma once
 #include "builtin.h"
+#include "exact/double_word.cuh"
 
 struct ExpansionSum {
     double* component;
     int length;
 
-    // Source: theorem 7 (Knuth).
-    static CUDA_CALLABLE double add_exactly(double a, double b, double& error) {
-        const double x = a + b, virtual_b = x - a, virtual_a = x - virtual_b;
-        error = (a - virtual_a) + (b - virtual_b);
-        return x;
-    }
     // Source: theorem 10.
     CUDA_CALLABLE void add(double b) {
-        double carry = b, tail;
+        double carry = b;
         int kept = 0;
         for (int i = 0; i < length; ++i) {
-            carry = add_exactly(carry, component[i], tail);
-            if (tail != 0.0)
-                component[kept++] = tail;
+            const DoubleWord sum = DoubleWord::add_exactly(carry, component[i]);
+            carry = sum.high;
+            if (sum.low != 0.0)
+                component[kept++] = sum.low;
         }
         if (carry != 0.0)
             component[kept++] = carry;

@@ -3,7 +3,25 @@
 // docs/exactness.md derives the bounds of what they err by.
 #pragma once
 #include "builtin.h"
-#include "exact/double_word.h"
+#include "exact/double_word.cuh"
+
+// A point of double words.
+struct Point {
+    DoubleWord x[3];
+
+    CALLED Point operator+(const Point& b) const { return {{x[0] + b.x[0], x[1] + b.x[1], x[2] + b.x[2]}}; }
+    CALLED Point operator-(const Point& b) const { return {{x[0] - b.x[0], x[1] - b.x[1], x[2] - b.x[2]}}; }
+    CALLED Point operator*(const DoubleWord& b) const { return {{x[0] * b, x[1] * b, x[2] * b}}; }
+    CALLED DoubleWord dot(const Point& b) const { return x[0] * b.x[0] + x[1] * b.x[1] + x[2] * b.x[2]; }
+    CALLED Point cross(const Point& b) const {
+        return {{x[1] * b.x[2] - x[2] * b.x[1], x[2] * b.x[0] - x[0] * b.x[2], x[0] * b.x[1] - x[1] * b.x[0]}};
+    }
+    CUDA_CALLABLE double largest() const {
+        return DoubleWord::larger(DoubleWord::larger(fabs(x[0].high), fabs(x[1].high)), fabs(x[2].high));
+    }
+    // Return the float64 numbers next to it.
+    CUDA_CALLABLE Point rounded() const { return {{{x[0].high, 0.0}, {x[1].high, 0.0}, {x[2].high, 0.0}}}; }
+};
 
 struct MovingFeatures {
     Point first[3], last[3];  // corners 1 to 3 seen from corner 0: a corner and a face, or edges 0 1 and 2 3

@@ -13,7 +13,7 @@ wp::int32 simd_near_filter(const ModelPool& models, const StatePool& states, con
     // Beyond these numbers float32 has no squares, or no bounds.
     if (!(pose.error < 0x1p20f) || !(gap < 0x1p40f))
         return waiting;
-    wp::vec_t<3, float> there;
+    wp::vec3 there;
     for (int i = 0; i < 3; ++i)
         there[i] = pose.translation32[i] * scale;
     int kept = 0;

@@ -15,18 +15,17 @@ inline CUDA_CALLABLE void write_number(wp::uint64 items, wp::int32 i, bool flag,
         *entry<volatile int>(items, i) = x;
 }
 
-inline CUDA_CALLABLE wp::vec_t<4, wp::float32> read_quarter(wp::uint64 items, wp::int32 i) {
+inline CUDA_CALLABLE wp::vec4 read_quarter(wp::uint64 items, wp::int32 i) {
     const Quarter q = *entry<Quarter>(items, i);
-    return wp::vec_t<4, wp::float32>(q.x, q.y, q.z, q.w);
+    return wp::vec4(q.x, q.y, q.z, q.w);
 }
 
-inline CUDA_CALLABLE void write_quarter(wp::uint64 items, wp::int32 i, bool flag, wp::vec_t<4, wp::float32> x) {
+inline CUDA_CALLABLE void write_quarter(wp::uint64 items, wp::int32 i, bool flag, wp::vec4 x) {
     if (flag)
         *entry<Quarter>(items, i) = Quarter{x[0], x[1], x[2], x[3]};
 }
 
-inline CUDA_CALLABLE bool spans_overlap(wp::vec_t<3, wp::float32> a, wp::vec_t<3, wp::float32> b,
-                                        wp::vec_t<3, wp::float32> c, wp::vec_t<3, wp::float32> d) {
+inline CUDA_CALLABLE bool spans_overlap(wp::vec3 a, wp::vec3 b, wp::vec3 c, wp::vec3 d) {
     return (a[0] <= d[0]) & (a[1] <= d[1]) & (a[2] <= d[2]) & (c[0] <= b[0]) & (c[1] <= b[1]) & (c[2] <= b[2]);
 }
 
@@ -56,9 +55,8 @@ inline CUDA_CALLABLE wp::int32 reserve_run(wp::array_t<wp::int32> total, wp::int
 #endif
 }
 
-inline CUDA_CALLABLE wp::uint32 compare_boxes(wp::uint64 items, wp::int32 rows, wp::vec_t<3, wp::float32> lower,
-                                              wp::vec_t<3, wp::float32> upper, wp::vec_t<3, wp::float32> posed_lower,
-                                              wp::vec_t<3, wp::float32> posed_upper) {
+inline CUDA_CALLABLE wp::uint32 compare_boxes(wp::uint64 items, wp::int32 rows, wp::vec3 lower, wp::vec3 upper,
+                                              wp::vec3 posed_lower, wp::vec3 posed_upper) {
     unsigned int bits = 0;
     // What lies behind the last row is read, too, and its bits are left out.
     for (int row = 0; row < rows; row += 2)

@@ -36,8 +36,8 @@ struct SweptRows {
 
 // Sorts the objects of a group, [first, end) of `order`, by their lower ends along an axis, and lists their boxes.
 inline void sort_sweep(wp::int32 first, wp::int32 end, wp::int32 axis, wp::array_t<wp::int32> order,
-                       wp::array_t<wp::vec_t<3, wp::float32>> lower, wp::array_t<wp::vec_t<3, wp::float32>> upper,
-                       wp::array_t<wp::int64> words, wp::array_t<wp::int32> place, wp::array_t<wp::float32> rows) {
+                       wp::array_t<wp::vec3> lower, wp::array_t<wp::vec3> upper, wp::array_t<wp::int64> words,
+                       wp::array_t<wp::int32> place, wp::array_t<wp::float32> rows) {
     const SweptRows swept(rows);
     const int count = end - first;
     SweptRows::word* own = (SweptRows::word*)words.data;

@@ -103,11 +103,11 @@ struct SegmentSort {
         }
     }
     // Write keys as rows of an object pair; the lowest bit is the pair's flag.
-    CUDA_CALLABLE void write_rows(const word* keys, int n, int pair, int flag, wp::vec_t<3, wp::int32>* rows) const {
+    CUDA_CALLABLE void write_rows(const word* keys, int n, int pair, int flag, wp::vec3i* rows) const {
         for (int thread = begin; thread < end; ++thread) {
             for (int i = thread; i < n; i += threads)
-                rows[i] = wp::vec_t<3, wp::int32>(pair | (keys[i] & 1 ? flag : 0), (wp::int32)(keys[i] >> 32),
-                                                  (wp::int32)((unsigned int)keys[i] >> 1));
+                rows[i] = wp::vec3i(pair | (keys[i] & 1 ? flag : 0), (wp::int32)(keys[i] >> 32),
+                                    (wp::int32)((unsigned int)keys[i] >> 1));
         }
     }
 };

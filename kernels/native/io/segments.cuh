@@ -5,7 +5,7 @@
 #include "io/segment_sort.h"
 
 inline CUDA_CALLABLE void start_segments(wp::int32 tile, wp::int32 rows, wp::int32 pair_mask,
-                                         wp::array_t<wp::int64> count, wp::array_t<wp::vec_t<3, wp::int32>> face,
+                                         wp::array_t<wp::int64> count, wp::array_t<wp::vec3i> face,
                                          wp::array_t<wp::int32> start) {
     const int pairs = start.shape[0] - 1, first = tile * SEGMENT_THREADS;
 #if defined(__CUDA_ARCH__)
@@ -101,7 +101,7 @@ inline CUDA_CALLABLE wp::int32 take_place(wp::array_t<wp::int32> end, wp::int32 
 
 inline CUDA_CALLABLE void sort_segment(wp::int32 thread, wp::int32 threads, wp::int32 flag,
                                        wp::array_t<wp::int32> start, wp::array_t<wp::int64> key,
-                                       wp::array_t<wp::vec_t<3, wp::int32>> sorted) {
+                                       wp::array_t<wp::vec3i> sorted) {
     typedef SegmentSort::word word;
     const int pair = thread / threads, run = SEGMENT_KEYS * threads;
     SegmentSort sort;

@@ -3,9 +3,8 @@
 #include "builtin.h"
 #include "base/radix.h"
 
-inline void sort_by_pair(wp::int32 count, wp::int32 pair_mask, wp::int32 flag,
-                         wp::array_t<wp::vec_t<3, wp::int32>> face, wp::array_t<wp::int64> key,
-                         wp::array_t<wp::vec_t<3, wp::int32>> sorted, wp::array_t<wp::int32> start) {
+inline void sort_by_pair(wp::int32 count, wp::int32 pair_mask, wp::int32 flag, wp::array_t<wp::vec3i> face,
+                         wp::array_t<wp::int64> key, wp::array_t<wp::vec3i> sorted, wp::array_t<wp::int32> start) {
     typedef unsigned long long word;
     const int pairs = start.shape[0] - 1;
     // Faces and the pair's flag in one word, by pairs; `start` counts to where each ends meanwhile.
@@ -20,7 +19,7 @@ inline void sort_by_pair(wp::int32 count, wp::int32 pair_mask, wp::int32 flag,
         sum += own;
     }
     for (int i = 0; i < count; ++i) {
-        const wp::vec_t<3, wp::int32>& row = face.data[i];
+        const wp::vec3i& row = face.data[i];
         const word second = 2u * (unsigned int)row[2] + (row[0] & flag ? 1u : 0u);
         one[start.data[row[0] & pair_mask]++] = (word)(unsigned int)row[1] << 32 | second;
     }
@@ -41,7 +40,7 @@ inline void sort_by_pair(wp::int32 count, wp::int32 pair_mask, wp::int32 flag,
             to = last;
         }
         for (int i = 0; i < length; ++i)
-            sorted.data[first + i] = wp::vec_t<3, wp::int32>(p | (from[i] & 1 ? flag : 0), (wp::int32)(from[i] >> 32),
-                                                             (wp::int32)((unsigned int)from[i] >> 1));
+            sorted.data[first + i] = wp::vec3i(p | (from[i] & 1 ? flag : 0), (wp::int32)(from[i] >> 32),
+                                               (wp::int32)((unsigned int)from[i] >> 1));
     }
 }

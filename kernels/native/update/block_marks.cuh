@@ -63,14 +63,14 @@ inline CUDA_CALLABLE bool unmark_bit(wp::uint64 marks, wp::int32 bit) {
     return (old & mask) != 0;
 }
 
-inline CUDA_CALLABLE void fetch_entry(wp::array_t<wp::vec_t<4, wp::float32>> values, wp::int64 i) {
+inline CUDA_CALLABLE void fetch_entry(wp::array_t<wp::vec4> values, wp::int64 i) {
 #if defined(__CUDA_ARCH__)
     // A load whose result nobody waits for.
     asm volatile("{ .reg .b32 unused; ld.global.ca.b32 unused, [%0]; }" ::"l"((const float4*)values.data + i));
 #endif
 }
 
-inline CUDA_CALLABLE void fetch_corner(wp::array_t<wp::vec_t<4, wp::int32>> values, wp::int32 i) {
+inline CUDA_CALLABLE void fetch_corner(wp::array_t<wp::vec4i> values, wp::int32 i) {
 #if defined(__CUDA_ARCH__)
     asm volatile("{ .reg .b32 unused; ld.global.ca.b32 unused, [%0]; }" ::"l"((const int4*)values.data + i));
 #endif

@@ -1,0 +1,57 @@
+// Items of 16 pairs of faces at a time, in halves: eight items each.
+#pragma once
+#include "builtin.h"
+#include "base/float32.h"
+
+struct FaceItems {
+    typedef Float32 F;
+    typedef F::bits bits;
+    typedef F::Point Point;
+    typedef unsigned int counts __attribute__((vector_size(64)));
+    typedef int loose __attribute__((vector_size(64), aligned(4)));
+    typedef wp::int64 longs __attribute__((vector_size(64)));
+    longs low, high;
+
+    // The first item in the place of those that lack.
+    __attribute__((always_inline)) FaceItems(const wp::int64* items, int count) {
+        const longs lane = {0, 1, 2, 3, 4, 5, 6, 7}, some = longs{} + items[0];
+        low = lane < count ? (longs) * (const loose*)items : some;
+        high = lane + 8 < count ? (longs) * (const loose*)(items + 8) : some;
+    }
+    // Put what a mask names behind a list, of which so many more places are written over; return how many.
+    __attribute__((always_inline)) int append(wp::int64* list, unsigned int which) const {
+        const int count = __builtin_popcount(which);
+#if defined(__AVX512VL__)
+        *(loose*)list = (loose)__builtin_ia32_compressdi512_mask(low, longs{}, which);
+        *(loose*)(list + __builtin_popcount(which & 255)) =
+            (loose)__builtin_ia32_compressdi512_mask(high, longs{}, which >> 8);
+#else
+        for (; which != 0; which &= which - 1) {
+            const int i = __builtin_ctz(which);
+            *list++ = i < 8 ? low[i] : high[i - 8];
+        }
+#endif
+        return count;
+    }
+    // Corners, each in the frame of its own model, of which A's faces start at a place, and B's.
+    __attribute__((always_inline)) void gather(const void* near, const void* corners, int start_a, int start_b,
+                                               Point (&a)[3], Point (&b)[3]) const {
+        const bits first = (bits)low, second = (bits)high;
+        // Rows of two faces, then of six corners: the high halves of the items, and the low ones.
+        alignas(64) F::sixteen face[2], corner[6];
+        *(counts*)face[0] = 2 * (counts)(start_a + __builtin_shufflevector(first, second, 1, 3, 5, 7, 9, 11, 13, 15, 17,
+                                                                           19, 21, 23, 25, 27, 29, 31));
+        *(counts*)face[1] = 2 * (counts)(start_b + __builtin_shufflevector(first, second, 0, 2, 4, 6, 8, 10, 12, 14, 16,
+                                                                           18, 20, 22, 24, 26, 28, 30));
+        for (int i = 0; i < 2; ++i) {
+            const Point c = F::gather(corners, face[i]);
+            *(counts*)corner[3 * i] = 2 * (counts)c.x;
+            *(counts*)corner[3 * i + 1] = 2 * (counts)c.y;
+            *(counts*)corner[3 * i + 2] = 2 * (counts)c.z;
+        }
+        for (int k = 0; k < 3; ++k) {
+            a[k] = F::gather(near, corner[k]);
+            b[k] = F::gather(near, corner[3 + k]);
+        }
+    }
+};
