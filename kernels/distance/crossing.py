@@ -64,10 +64,8 @@ def search_crossing(trees: Trees, pose: PairPose, scaling: SearchScale, room: wp
         live = wp.where(kind == NODES and warp_lane() < first, -1, 0)
         if kind != NODES:
             item = first_item(trees.states, pose)
-        children, kinds, _bounds, _tests = bound_children(
-            False, trees.states, Slabs(), pose, scaling, wp.float32(0.0), item, live
-        )
-        push_in_order(items, end, kinds, children)
+        emitted = bound_children(False, trees.states, Slabs(), pose, scaling, wp.float32(0.0), item, live)
+        push_in_order(items, end, emitted.kinds, emitted.items)
         warp_sync()
     return found
 

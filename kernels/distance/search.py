@@ -178,12 +178,10 @@ def expand_nearest(
     item = read_item(items, at)
     live = wp.where(warp_lane() < popped and read_bound(items, at) <= limit, -1, 0)
     warp_sync()
-    children, kinds, bounds, compared = bound_children(
-        with_slabs, states, slabs, search.pose, search.scaling, limit, item, live
-    )
-    push_nearest(items, end, waiting, kinds, children, bounds)
+    emitted = bound_children(with_slabs, states, slabs, search.pose, search.scaling, limit, item, live)
+    push_nearest(items, end, waiting, emitted.kinds, emitted.items, emitted.bounds)
     warp_sync()
-    return compared
+    return emitted.tests
 
 
 @wp.func

@@ -29,7 +29,7 @@ from warp_abtree.kernels.motion.face_pair import (
 from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
 from warp_abtree.kernels.motion.linear import EndPoses
 from warp_abtree.kernels.motion.start import OPEN, FirstContacts
-from warp_abtree.kernels.search.item import FACES, NODES, first_item, four_items, item_first, item_second
+from warp_abtree.kernels.search.item import FACES, NODES, Emitted, first_item, four_items, item_first, item_second
 from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item
 
@@ -244,15 +244,13 @@ def search_group(
             p, best = group.first + slot, time_of(group, slot)
             live = wp.where(warp_lane() < popped and wp.float64(t) <= best, -1, 0)
             warp_sync()
-            children, kinds, times, compared = four_items(), wp.vec4i(), wp.vec4(), wp.int32(0)
+            emitted = Emitted()
             if warp_any(live < 0):
-                children, kinds, times, compared = advance_nodes(
-                    trees.states, pair_poses[p], motion[p], t, best, item, live
-                )
-            pushed = push_steps(items, wp.vec2i(end, ends[1]), slot, kinds, children, times)
+                emitted = advance_nodes(trees.states, pair_poses[p], motion[p], t, best, item, live)
+            pushed = push_steps(items, wp.vec2i(end, ends[1]), slot, emitted.kinds, emitted.items, emitted.bounds)
             warp_sync()
             ends = wp.vec3i(pushed[0], pushed[1], ends[2])
-            count_in(group.nodes, slot, compared)
+            count_in(group.nodes, slot, emitted.tests)
         mode = wp.where(ends[2] >= warp_size() or ends[1] == 0, ONE_STEP, NORMALS)
         most = wp.where(mode == ONE_STEP, ends[2], ends[1])
         if most >= warp_size() or (ends[0] == 0 and most > 0):

@@ -93,9 +93,9 @@ def search_contact(
             end -= 1
             item, t = read_item(items, end), read_bound(items, end)
             if wp.float64(t) <= best.time:
-                children, kinds, times, compared = advance_nodes(trees.states, pose, motions[p], t, best.time, item, -1)
-                push_nearest(items, end, waiting, kinds, children, times)
-                tests.nodes += compared
+                emitted = advance_nodes(trees.states, pose, motions[p], t, best.time, item, -1)
+                push_nearest(items, end, waiting, emitted.kinds, emitted.items, emitted.bounds)
+                tests.nodes += emitted.tests
     return best, tests
 
 
