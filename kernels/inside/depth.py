@@ -40,10 +40,10 @@ from warp_abtree.kernels.inside.samples import (
     sample_weights,
 )
 from warp_abtree.kernels.intersect.face_pairs import Hits
-from warp_abtree.kernels.search.item import FACES, NODES, four_items, item_first, item_second, pack_item
-from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM
-from warp_abtree.kernels.search.nearest_stack import nearest_stack, push_nearest, read_bound, write_bound
-from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item, write_item
+from warp_abtree.kernels.search.best_first import BestFirstPolicy, Entry, SearchLists, best_first, start_lists
+from warp_abtree.kernels.search.item import FACES, NODES, Emitted, item_first, item_second, pack_item
+from warp_abtree.kernels.search.nearest_stack import NEAREST_MEMORY, nearest_stack, write_bound
+from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, write_item
 
 MODULE_OPTIONS = native.options("base/lanes.cuh", "exact/determinant.cuh", "search/nearest_stack.cuh")
 wp.set_module_options(MODULE_OPTIONS)
@@ -94,68 +94,93 @@ def bound_depth(
     return distance + reach, near
 
 
+@wp.struct
+class DepthSearch:
+    """Search for the deepest sample of one object inside the other."""
+
+    pose: PairPose  # of B in A's frame
+    inner: Solid  # whose samples are looked at
+    outer: Solid  # what they are inside
+    sampling: Sampling  # which of them count
+    best: Deepest  # so far, the same in all lanes
+
+
 @wp.func
-def agree(best: Deepest):
-    """Return the deepest sample of all lanes, the lowest of several."""
-    found = Deepest()
-    found.depth = warp_max(best.depth)
-    found.item = warp_min_item(wp.where(best.depth == found.depth, best.item, NO_SAMPLE))
-    return found
+def keep_best(given: wp.int32, search: wp.ref[DepthSearch], lists: wp.ref[SearchLists]):
+    pass
+
+
+@wp.func
+def expand_node(trees: Trees, given: wp.int32, search: wp.ref[DepthSearch], entry: Entry):
+    """Bound the samples below both children of a node; its item names the outer face that was nearest above it, too."""
+    emitted = Emitted()
+    live = entry.live and wp.float64(-entry.bound) >= search.best.depth
+    for k in range(2):
+        child = load_node(trees.states, search.inner.node + wp.where(live, 2 * item_first(entry.item) + k, 1))
+        if live:
+            bound, near = bound_depth(
+                trees,
+                search.pose,
+                search.inner,
+                search.outer,
+                child,
+                item_second(entry.item),
+                search.best.depth,
+                search.sampling,
+            )
+            if bound >= wp.float64(0.0):
+                emitted.kinds[k] = wp.where(child.face >= 0, FACES, NODES)
+                emitted.items[k] = pack_item(wp.where(child.face >= 0, child.face, child.skip), near)
+                emitted.bounds[k] = -round_up(bound)
+    return emitted
+
+
+@wp.func
+def measure_face(
+    trees: Trees,
+    given: wp.int32,
+    search: wp.ref[DepthSearch],
+    lists: wp.ref[SearchLists],
+    entry: Entry,
+):
+    """Measure the samples of a face, one a lane, and take the deepest of all lanes, the lowest of several."""
+    best = search.best
+    if entry.live and wp.float64(-entry.bound) >= best.depth:
+        face, near = item_first(entry.item), item_second(entry.item)
+        best = measure_samples(trees, search.pose, search.inner, search.outer, face, near, best, search.sampling)
+    warp_sync()
+    search.best.depth = warp_max(best.depth)
+    search.best.item = warp_min_item(wp.where(best.depth == search.best.depth, best.item, NO_SAMPLE))
+
+
+search_depth = best_first(
+    BestFirstPolicy(NEAREST_MEMORY, wp.int32, DepthSearch, keep_best, expand_node, measure_face, measure_face, shift=1)
+)
 
 
 @wp.func
 def find_deepest_sample(
     trees: Trees, pose: PairPose, inner: Solid, outer: Solid, room: wp.int32, known: Deepest, sampling: Sampling
 ):
-    """Return the deepest of a known sample and all samples of one object inside the other, the same in all lanes.
-
-    The children that may be deepest come first; faces wait until there is one for each lane. An item names a node or a
-    face, and the outer face that was nearest above it, where the next search starts.
-    """
-    best = known
-    items = nearest_stack()
+    """Return the deepest of a known sample and all samples of one object inside the other, the same in all lanes."""
+    search = DepthSearch()
+    search.pose = pose
+    search.inner = inner
+    search.outer = outer
+    search.sampling = sampling
+    search.best = known
+    lists = start_lists(nearest_stack(), room)
     root = load_node(trees.states, inner.node + 1)
     # A single face waits at once.
-    waiting = wp.where(root.face >= 0, 1, 0)
-    end = 1 - waiting
+    lists.waiting = wp.where(root.face >= 0, 1, 0)
+    lists.end = 1 - lists.waiting
     if warp_lane() == 0:
-        at = STACK_LENGTH * waiting
-        write_item(items, at, pack_item(wp.where(root.face >= 0, root.face, root.skip), NO_NEAREST))
-        write_bound(items, at, -wp.float32(wp.inf))
+        at = STACK_LENGTH * lists.waiting
+        write_item(lists.items, at, pack_item(wp.where(root.face >= 0, root.face, root.skip), NO_NEAREST))
+        write_bound(lists.items, at, -wp.float32(wp.inf))
     warp_sync()
-    while end > 0 or waiting > 0:
-        if end > 0 and waiting < warp_size():
-            popped = wp.max(1, (room - DEPTH_FIRST_ROOM - end) >> 1)
-            popped = wp.min(popped, wp.min(warp_size(), end))
-            end -= popped
-            at = end + wp.min(warp_lane(), popped - 1)
-            item = read_item(items, at)
-            node = item_first(item)
-            live = warp_lane() < popped and wp.float64(-read_bound(items, at)) >= best.depth
-            warp_sync()
-            children, kinds, bounds = four_items(), wp.vec4i(), wp.vec4()
-            for k in range(2):
-                child = load_node(trees.states, inner.node + wp.where(live, 2 * node + k, 1))
-                if live:
-                    near = item_second(item)
-                    bound, near = bound_depth(trees, pose, inner, outer, child, near, best.depth, sampling)
-                    if bound >= wp.float64(0.0):
-                        kinds[k] = wp.where(child.face >= 0, FACES, NODES)
-                        children[k] = pack_item(wp.where(child.face >= 0, child.face, child.skip), near)
-                        bounds[k] = -round_up(bound)
-            push_nearest(items, end, waiting, kinds, children, bounds)
-            warp_sync()
-        if waiting >= warp_size() or (waiting > 0 and end == 0):
-            popped = wp.min(waiting, warp_size())
-            waiting -= popped
-            at = STACK_LENGTH + waiting + wp.min(warp_lane(), popped - 1)
-            item = read_item(items, at)
-            if warp_lane() < popped and wp.float64(-read_bound(items, at)) >= best.depth:
-                face, near = item_first(item), item_second(item)
-                best = measure_samples(trees, pose, inner, outer, face, near, best, sampling)
-            warp_sync()
-            best = agree(best)
-    return best
+    search_depth(trees, 0, search, lists)
+    return search.best
 
 
 @wp.func
