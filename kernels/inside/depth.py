@@ -115,6 +115,7 @@ def expand_node(trees: Trees, given: wp.int32, search: wp.ref[DepthSearch], entr
     """Bound the samples below both children of a node; its item names the outer face that was nearest above it, too."""
     emitted = Emitted()
     live = entry.live and wp.float64(-entry.bound) >= search.best.depth
+    emitted.tests = wp.where(live, 2, 0)
     for k in range(2):
         child = load_node(trees.states, search.inner.node + wp.where(live, 2 * item_first(entry.item) + k, 1))
         if live:

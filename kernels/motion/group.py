@@ -20,7 +20,6 @@ from warp_abtree.kernels.motion.face_pair import (
     IN_PROGRESS,
     NORMALS,
     ONE_STEP,
-    TO_THE_END,
     TOUCHES,
     UNDECIDED,
     FirstContact,
@@ -31,7 +30,7 @@ from warp_abtree.kernels.motion.linear import EndPoses
 from warp_abtree.kernels.motion.start import OPEN, FirstContacts
 from warp_abtree.kernels.search.best_first import BestFirstPolicy, Entry, SearchLists, best_first, start_lists
 from warp_abtree.kernels.search.item import Emitted, first_item, item_first, item_second
-from warp_abtree.kernels.search.nearest_stack import NEAREST_MEMORY, SearchMemory
+from warp_abtree.kernels.search.nearest_stack import SearchMemory
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item
 
 MODULE_OPTIONS = native.options(
@@ -77,6 +76,20 @@ def write_time(items: wp.uint64, i: wp.int32, time: wp.float64):
 MOTION_MEMORY = SearchMemory(MOTION_STACK_LENGTH, GOING_START, -1, read_tag, read_slot, write_entry)
 
 
+@cache
+def motion_given(kind):
+    """Return the struct of what searches for first contacts are given, for motions of a kind."""
+
+    @wp.struct
+    class MotionGiven:
+        tolerance: wp.float64  # of times
+        batch: PairBatch  # the object pairs
+        poses: EndPoses  # of objects
+        motion: wp.array(dtype=kind)  # of each object pair
+
+    return MotionGiven
+
+
 @wp.struct
 class Group:
     """Object pairs that a warp searches, a slot each."""
@@ -117,22 +130,16 @@ def take_contacts(group: wp.ref[Group], slot: wp.int32, own: FirstContact):
 
 
 @cache
-def motion_policy(kind, threads: bool) -> BestFirstPolicy:
-    """Return the policy for motions of a kind: of warps, or of threads, which advance face pairs to their end."""
-
-    @wp.struct
-    class MotionGiven:
-        tolerance: wp.float64  # of times
-        batch: PairBatch  # the object pairs
-        poses: EndPoses  # of objects
-        motion: wp.array(dtype=kind)  # of each object pair
+def group_policy(kind) -> BestFirstPolicy:
+    """Return the policy of warps for motions of a kind."""
+    given_type = motion_given(kind)
 
     @wp.func
-    def keep_contacts(given: MotionGiven, group: wp.ref[Group], lists: wp.ref[SearchLists]):
+    def keep_contacts(given: given_type, group: wp.ref[Group], lists: wp.ref[SearchLists]):
         pass
 
     @wp.func
-    def expand(trees: Trees, given: MotionGiven, group: wp.ref[Group], entry: Entry):
+    def expand(trees: Trees, given: given_type, group: wp.ref[Group], entry: Entry):
         """Advance the children of node pairs, one a lane."""
         p, best = group.first + entry.slot, time_of(group, entry.slot)
         live = wp.where(entry.live and wp.float64(entry.bound) <= best, -1, 0)
@@ -145,19 +152,15 @@ def motion_policy(kind, threads: bool) -> BestFirstPolicy:
         return emitted
 
     @wp.func
-    def advance(trees: Trees, given: MotionGiven, group: wp.ref[Group], lists: wp.ref[SearchLists], entry: Entry):
+    def advance(trees: Trees, given: given_type, group: wp.ref[Group], lists: wp.ref[SearchLists], entry: Entry):
         """Advance face pairs, one a lane: those that wait by normals, those that go on by a step."""
-        goes_on = wp.bool(False)
+        goes_on = entry.at >= GOING_START
         progress = PairProgress()
+        progress.mode = wp.where(goes_on, ONE_STEP, NORMALS)
         progress.time = wp.float64(entry.bound)
-        if wp.static(threads):
-            progress.mode = TO_THE_END
-        else:
-            goes_on = entry.at >= GOING_START
-            progress.mode = wp.where(goes_on, ONE_STEP, NORMALS)
-            if goes_on:
-                progress.time = wp.cast(read_item(lists.items, TIMES_START + entry.at - GOING_START), wp.float64)
-                progress.steps = wp.int32(entry.bound)
+        if goes_on:
+            progress.time = wp.cast(read_item(lists.items, TIMES_START + entry.at - GOING_START), wp.float64)
+            progress.steps = wp.int32(entry.bound)
         best = time_of(group, entry.slot)
         live = entry.live and progress.time <= best
         own, steps = FirstContact(), wp.int32(0)
@@ -169,15 +172,13 @@ def motion_policy(kind, threads: bool) -> BestFirstPolicy:
             )
         count_in(group.faces, entry.slot, wp.where(live and not goes_on, 1, 0))
         take_contacts(group, entry.slot, own)
-        if wp.static(not threads):
-            more = own.end == IN_PROGRESS and own.time <= time_of(group, entry.slot)
-            place = next_place(lists.opened, more)
-            if more:
-                write_entry(lists.items, GOING_START + place, entry.item, wp.float32(steps), entry.slot)
-                write_time(lists.items, place, own.time)
+        more = own.end == IN_PROGRESS and own.time <= time_of(group, entry.slot)
+        place = next_place(lists.opened, more)
+        if more:
+            write_entry(lists.items, GOING_START + place, entry.item, wp.float32(steps), entry.slot)
+            write_time(lists.items, place, own.time)
 
-    memory = NEAREST_MEMORY if threads else MOTION_MEMORY
-    return BestFirstPolicy(memory, MotionGiven, Group, keep_contacts, expand, advance, advance, turns=True)
+    return BestFirstPolicy(MOTION_MEMORY, given_type, Group, keep_contacts, expand, advance, advance, turns=True)
 
 
 @wp.func
@@ -209,7 +210,7 @@ def start_group(
 @cache
 def warp_motion_search(kind):
     """Return the kernel of warps for motions of a kind: `path.Motion` or `linear.LinearMotion`."""
-    policy = motion_policy(kind, False)
+    policy = group_policy(kind)
     search_group, given_type = best_first(policy), policy.given
 
     # Fourteen warps a multiprocessor hide more of what loads wait for than spilled registers cost.

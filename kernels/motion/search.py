@@ -14,13 +14,15 @@ from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.intersect.face_pairs import Hits
-from warp_abtree.kernels.motion.group import Group, motion_policy
+from warp_abtree.kernels.motion.face_pair import CLEAR, TO_THE_END, TOUCHES, FirstContact, PairProgress
+from warp_abtree.kernels.motion.group import motion_given
+from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
 from warp_abtree.kernels.motion.linear import EndPoses
 from warp_abtree.kernels.motion.start import OPEN, FirstContacts
-from warp_abtree.kernels.search.best_first import best_first, start_lists
-from warp_abtree.kernels.search.item import first_item
+from warp_abtree.kernels.search.best_first import BestFirstPolicy, Entry, SearchLists, best_first, start_lists
+from warp_abtree.kernels.search.item import Emitted, first_item, item_first, item_second
 from warp_abtree.kernels.search.load_balance import take_thread, take_unit
-from warp_abtree.kernels.search.nearest_stack import write_bounded
+from warp_abtree.kernels.search.nearest_stack import NEAREST_MEMORY, write_bounded
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, STRADDLING_START
 
 MODULE_OPTIONS = native.options(
@@ -42,10 +44,61 @@ def thread_lists(memory: wp.array2d(dtype=wp.int64), thread: wp.int32) -> wp.uin
     """Return the address of a CPU thread's lists."""
 
 
+@wp.struct
+class ContactSearch:
+    """Search of a thread for the first contact of an object pair."""
+
+    pair: wp.int32  # its number
+    best: FirstContact  # so far
+    nodes: wp.int32  # pairs of boxes compared
+    faces: wp.int32  # pairs of faces advanced
+
+
+@cache
+def contact_policy(kind) -> BestFirstPolicy:
+    """Return the policy of threads for motions of a kind: face pairs are advanced to their end, one after the other."""
+    given_type = motion_given(kind)
+
+    @wp.func
+    def keep_contact(given: given_type, search: wp.ref[ContactSearch], lists: wp.ref[SearchLists]):
+        pass
+
+    @wp.func
+    def expand(trees: Trees, given: given_type, search: wp.ref[ContactSearch], entry: Entry):
+        p, t, best = search.pair, entry.bound, search.best.time
+        emitted = Emitted()
+        if wp.float64(t) <= best:
+            emitted = advance_nodes(trees.states, given.batch.poses[p], given.motion[p], t, best, entry.item, -1)
+            search.nodes += emitted.tests
+        return emitted
+
+    @wp.func
+    def advance(
+        trees: Trees, given: given_type, search: wp.ref[ContactSearch], lists: wp.ref[SearchLists], entry: Entry
+    ):
+        p, best = search.pair, search.best
+        progress = PairProgress()
+        progress.time = wp.float64(entry.bound)
+        progress.mode = TO_THE_END
+        if progress.time <= best.time:
+            faces = wp.vec2i(item_first(entry.item), item_second(entry.item))
+            own, _ = advance_faces(
+                given.tolerance, trees, given.poses, given.batch.poses[p], given.motion[p], faces, progress, best.time
+            )
+            if own.end != CLEAR and (own.time < best.time or (own.time == best.time and best.end != TOUCHES)):
+                # A pair that is undecided at the same time does not matter.
+                search.best = own
+            search.faces += 1
+
+    return BestFirstPolicy(
+        NEAREST_MEMORY, given_type, ContactSearch, keep_contact, expand, advance, advance, turns=True
+    )
+
+
 @cache
 def thread_motion_search(kind):
     """Return the kernel of the CPU's threads for motions of a kind."""
-    policy = motion_policy(kind, True)
+    policy = contact_policy(kind)
     search_pair, given_type = best_first(policy), policy.given
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
@@ -75,18 +128,18 @@ def thread_motion_search(kind):
         p = take_unit(contacts_inout.counter)
         while p < count:
             if contacts_inout.end[p] == OPEN:
-                group = Group()
-                group.first = p
-                group.time[0] = wp.float64(1.0)
+                search = ContactSearch()
+                search.pair = p
+                search.best.time = wp.float64(1.0)
                 write_bounded(
                     lists.items, 0, first_item(trees.states, batch.poses[p]), wp.float32(contacts_inout.time[p]), 0
                 )
                 lists.end = 1
-                search_pair(trees, given, group, lists)
-                contacts_inout.time[p] = group.time[0]
-                contacts_inout.end[p] = group.end[0]
-                hits_inout.node_tests[p] += wp.int64(group.nodes[0])
-                hits_inout.triangle_tests[p] += wp.int64(group.faces[0])
+                search_pair(trees, given, search, lists)
+                contacts_inout.time[p] = search.best.time
+                contacts_inout.end[p] = search.best.end
+                hits_inout.node_tests[p] += wp.int64(search.nodes)
+                hits_inout.triangle_tests[p] += wp.int64(search.faces)
             p = take_unit(contacts_inout.counter)
 
     return search_thread_kernel

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import Trees
-from warp_abtree.kernels.base.lanes import next_place, warp_lane, warp_size, warp_sync
+from warp_abtree.kernels.base.lanes import next_place, warp_any, warp_lane, warp_size, warp_sync
 from warp_abtree.kernels.search.item import FACES, NODES, Emitted
 from warp_abtree.kernels.search.load_balance import (
     DEPTH_FIRST_ROOM,
@@ -164,7 +164,8 @@ def best_first(policy: BestFirstPolicy):
                 lists.end -= popped
                 entry = take_entry(lists, (lists.end + place_of_lane(popped)) & wp.static(mask), popped)
                 emitted = expand(trees, given, state, entry)
-                push_emitted(lists, emitted, entry.slot)
+                if warp_any(emitted.tests > 0):
+                    push_emitted(lists, emitted, entry.slot)
             if wp.static(turns):
                 in_open = lists.opened >= lists.open_ready or lists.waiting == 0
                 most = wp.where(in_open, lists.opened, lists.waiting)
