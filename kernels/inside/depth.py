@@ -45,7 +45,9 @@ from warp_abtree.kernels.search.item import FACES, NODES, Emitted, item_first, i
 from warp_abtree.kernels.search.nearest_stack import NEAREST_MEMORY, nearest_stack, write_bound
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, write_item
 
-MODULE_OPTIONS = native.options("base/lanes.cuh", "exact/determinant.cuh", "search/nearest_stack.cuh")
+MODULE_OPTIONS = native.options(
+    "base/lanes.cuh", "exact/determinant.cuh", "search/load_balance.cuh", "search/nearest_stack.cuh"
+)
 wp.set_module_options(MODULE_OPTIONS)
 
 

@@ -38,6 +38,7 @@ MODULE_OPTIONS = native.options(
     "base/lanes.cuh",
     "exact/apart_until.cuh",
     "exact/determinant.cuh",
+    "search/load_balance.cuh",
     "search/motion_stack.cuh",
     "search/nearest_stack.cuh",
 )

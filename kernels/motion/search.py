@@ -30,7 +30,6 @@ MODULE_OPTIONS = native.options(
     "exact/apart_until.cuh",
     "exact/determinant.cuh",
     "search/load_balance.cuh",
-    "search/motion_stack.cuh",
     "search/nearest_stack.cuh",
 )
 wp.set_module_options(MODULE_OPTIONS)

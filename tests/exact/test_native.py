@@ -149,6 +149,10 @@ def reached(adjoint, found):
 MAKERS = {
     "contacts.near_search": [lambda made: made.thread_near_search()],
     "contacts.points": [lambda made: made.point_chooser(4)],
+    "distance.within": [
+        lambda made: made.thread_within(made.PROVED_APART),
+        lambda made: made.warp_within(made.PROVED_APART),
+    ],
     "intersect.dual_tree": [lambda made: made.warp_traversal(int(EXACT), False)],
     "intersect.relative_pose": [lambda made: made.relative_poses(False)],
     "intersect.simd": [lambda made: made.thread_traversal(int(EXACT))],
