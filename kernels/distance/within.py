@@ -15,7 +15,7 @@ from warp_abtree.kernels.base.lanes import warp_lane, warp_sync
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.exact.predicates import EXACT
 from warp_abtree.kernels.intersect.dual_tree import add_pair_tests, pair_has_hit
-from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, OUTPUT_COUNT, Hits, faces_near, test_faces
+from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, OUTPUT_COUNT, Hits, test_faces
 from warp_abtree.kernels.intersect.relative_pose import pairs_starter
 from warp_abtree.kernels.intersect.simd import write_counts
 from warp_abtree.kernels.search.item import item_first, item_second
@@ -29,7 +29,8 @@ from warp_abtree.kernels.search.warp_stack import (
     push_straddling,
     read_item,
 )
-from warp_abtree.kernels.triangle.corners import load_triangles
+from warp_abtree.kernels.triangle.corners import load_face_pair, load_triangles
+from warp_abtree.kernels.triangle.distance import triangles_near
 from warp_abtree.kernels.triangle.triangle_pair import triangle_distance
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -182,6 +183,10 @@ def thread_within(question: Question):
     return thread_search(policy, int(OUTPUT_ANY))
 
 
+# Headers that visits need which ask for distances.
+DISTANCE_HEADERS = ("exact/determinant.cuh",)
+
+
 @wp.func
 def face_distance(trees: Trees, pose: PairPose, faces: wp.vec2i):
     """Return the least distance of a face of A and one of B [world units], 0 where they intersect."""
@@ -193,7 +198,11 @@ def face_distance(trees: Trees, pose: PairPose, faces: wp.vec2i):
 
 @wp.func
 def visit_near(pair: wp.int32, faces: wp.vec2i, trees: Trees, pose: PairPose, own: wp.int32):
-    return faces_near(trees, pose, faces[0], faces[1]) == 1
+    """Return False where faces are proved farther apart than `within`, in float64."""
+    a = trees.states.face_corner[pose.corner_a + faces[0]]
+    b = trees.states.face_corner[pose.corner_b + faces[1]]
+    a0, a1, a2, b0, b1, b2 = load_face_pair(trees.models, pose, a, b)
+    return triangles_near(pose.within, a0, a1, a2, b0, b1, b2) == 1
 
 
 # Which object pairs are not proved farther apart than a distance.

@@ -6,7 +6,7 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import PairPose
-from warp_abtree.kernels.distance.within import Question, face_distance
+from warp_abtree.kernels.distance.within import DISTANCE_HEADERS, Question, face_distance
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.stage import Array, Rooms
 from warp_abtree.query.stages.intersect import VisitStage
@@ -51,6 +51,6 @@ class FaceQuery(Operator):
     """
 
     def __init__(self, scene, visit, own: Any, pairs=None, within=0.0, for_any=False, capacity=None, sort_pairs=False):
-        question = Question(visit, own._cls, for_any, ("exact/determinant.cuh",))
+        question = Question(visit, own._cls, for_any, DISTANCE_HEADERS)
         stage, output = FaceStage(within, question, own), "any" if for_any else "count"
         super().__init__(scene, [stage], pairs, capacity, output, sort_pairs)
