@@ -108,11 +108,6 @@ class DepthSearch:
 
 
 @wp.func
-def keep_best(given: wp.int32, search: wp.ref[DepthSearch], lists: wp.ref[SearchLists]):
-    pass
-
-
-@wp.func
 def expand_node(trees: Trees, given: wp.int32, search: wp.ref[DepthSearch], entry: Entry):
     """Bound the samples below both children of a node; its item names the outer face that was nearest above it, too."""
     emitted = Emitted()
@@ -157,7 +152,7 @@ def measure_face(
 
 
 search_depth = best_first(
-    BestFirstPolicy(NEAREST_MEMORY, wp.int32, DepthSearch, keep_best, expand_node, measure_face, measure_face, shift=1)
+    BestFirstPolicy(NEAREST_MEMORY, wp.int32, DepthSearch, None, expand_node, measure_face, measure_face, shift=1)
 )
 
 

@@ -136,10 +136,6 @@ def group_policy(kind) -> BestFirstPolicy:
     given_type = motion_given(kind)
 
     @wp.func
-    def keep_contacts(given: given_type, group: wp.ref[Group], lists: wp.ref[SearchLists]):
-        pass
-
-    @wp.func
     def expand(trees: Trees, given: given_type, group: wp.ref[Group], entry: Entry):
         """Advance the children of node pairs, one a lane."""
         p, best = group.first + entry.slot, time_of(group, entry.slot)
@@ -179,7 +175,7 @@ def group_policy(kind) -> BestFirstPolicy:
             write_entry(lists.items, GOING_START + place, entry.item, wp.float32(steps), entry.slot)
             write_time(lists.items, place, own.time)
 
-    return BestFirstPolicy(MOTION_MEMORY, given_type, Group, keep_contacts, expand, advance, advance, turns=True)
+    return BestFirstPolicy(MOTION_MEMORY, given_type, Group, None, expand, advance, advance, turns=True)
 
 
 @wp.func

@@ -59,10 +59,6 @@ def contact_policy(kind) -> BestFirstPolicy:
     given_type = motion_given(kind)
 
     @wp.func
-    def keep_contact(given: given_type, search: wp.ref[ContactSearch], lists: wp.ref[SearchLists]):
-        pass
-
-    @wp.func
     def expand(trees: Trees, given: given_type, search: wp.ref[ContactSearch], entry: Entry):
         p, t, best = search.pair, entry.bound, search.best.time
         emitted = Emitted()
@@ -89,9 +85,7 @@ def contact_policy(kind) -> BestFirstPolicy:
                 search.best = own
             search.faces += 1
 
-    return BestFirstPolicy(
-        NEAREST_MEMORY, given_type, ContactSearch, keep_contact, expand, advance, advance, turns=True
-    )
+    return BestFirstPolicy(NEAREST_MEMORY, given_type, ContactSearch, None, expand, advance, advance, turns=True)
 
 
 @cache

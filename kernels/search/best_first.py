@@ -79,7 +79,7 @@ class BestFirstPolicy(NamedTuple):
         memory: Where its lists are.
         given: Struct of what it reads, and what it shares with other warps.
         state: Struct of what a lane knows.
-        refresh: (given, state, lists).
+        refresh: (given, state, lists), None where the state has it all.
         expand: (trees, given, state, entry) -> `Emitted`.
         leaf, open: (trees, given, state, lists, entry).
         turns: Whether a turn tests leaf pairs or open pairs, both by `leaf`, which asks `in_open` of an entry; else
@@ -91,7 +91,7 @@ class BestFirstPolicy(NamedTuple):
     memory: SearchMemory
     given: Any
     state: Any
-    refresh: Callable
+    refresh: Callable | None
     expand: Callable
     leaf: Callable
     open: Callable
@@ -156,7 +156,8 @@ def best_first(policy: BestFirstPolicy):
             tickets = wp.int64(0)
             if wp.static(donates > 0):
                 tickets = load_tickets(given.work.counter)
-            refresh(given, state, lists)
+            if wp.static(refresh is not None):
+                refresh(given, state, lists)
             size = lists.end - lists.head
             if size > 0 and lists.waiting < warp_size() and lists.opened < lists.open_ready:
                 popped = count_to_pop(lists.room - DEPTH_FIRST_ROOM - size, wp.static(shift), size)
