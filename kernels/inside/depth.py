@@ -51,22 +51,25 @@ MODULE_OPTIONS = native.options(
 wp.set_module_options(MODULE_OPTIONS)
 
 
+@wp.struct
+class DepthSearch:
+    """Search for the deepest sample of one object inside the other."""
+
+    pose: PairPose  # of B in A's frame
+    inner: Solid  # whose samples are looked at
+    outer: Solid  # what they are inside
+    sampling: Sampling  # which of them count
+    best: Deepest  # so far, the same in all lanes
+
+
 @wp.func
-def bound_depth(
-    trees: Trees,
-    pose: PairPose,
-    inner: Solid,
-    outer: Solid,
-    node: Node,
-    hint: wp.int32,
-    known: wp.float64,
-    sampling: Sampling,
-):
+def bound_depth(trees: Trees, search: DepthSearch, node: Node, hint: wp.int32):
     """Return an upper bound of the depth below a node, negative only if less than what is known, and a face.
 
     With the node's middle at a distance d from the surface, and points within r of it, an inside point is no deeper
     than d + r, and no deeper than r - d where the middle is outside: the surface lies between them.
     """
+    pose, inner, outer, known = search.pose, search.inner, search.outer, search.best.depth
     none = -wp.float64(1.0)
     if node.skip < 0:
         return none, hint
@@ -75,7 +78,7 @@ def bound_depth(
     if inner.of_b:
         middle = pose_point(pose.rotation, pose.translation, middle)
     reach = wp.length(HALF * (upper - lower)) * outer.grow + outer.margin
-    if is_avoided(sampling, middle, reach):
+    if is_avoided(search.sampling, middle, reach):
         return none, hint
     # What is inside lies within the root's box, and no deeper than its nearest side.
     root = load_node(trees.states, outer.node + 1)
@@ -96,17 +99,6 @@ def bound_depth(
     return distance + reach, near
 
 
-@wp.struct
-class DepthSearch:
-    """Search for the deepest sample of one object inside the other."""
-
-    pose: PairPose  # of B in A's frame
-    inner: Solid  # whose samples are looked at
-    outer: Solid  # what they are inside
-    sampling: Sampling  # which of them count
-    best: Deepest  # so far, the same in all lanes
-
-
 @wp.func
 def expand_node(trees: Trees, given: wp.int32, search: wp.ref[DepthSearch], entry: Entry):
     """Bound the samples below both children of a node; its item names the outer face that was nearest above it, too."""
@@ -116,16 +108,7 @@ def expand_node(trees: Trees, given: wp.int32, search: wp.ref[DepthSearch], entr
     for k in range(2):
         child = load_node(trees.states, search.inner.node + wp.where(live, 2 * item_first(entry.item) + k, 1))
         if live:
-            bound, near = bound_depth(
-                trees,
-                search.pose,
-                search.inner,
-                search.outer,
-                child,
-                item_second(entry.item),
-                search.best.depth,
-                search.sampling,
-            )
+            bound, near = bound_depth(trees, search, child, item_second(entry.item))
             if bound >= wp.float64(0.0):
                 emitted.kinds[k] = wp.where(child.face >= 0, FACES, NODES)
                 emitted.items[k] = pack_item(wp.where(child.face >= 0, child.face, child.skip), near)
@@ -157,18 +140,10 @@ search_depth = best_first(
 
 
 @wp.func
-def find_deepest_sample(
-    trees: Trees, pose: PairPose, inner: Solid, outer: Solid, room: wp.int32, known: Deepest, sampling: Sampling
-):
-    """Return the deepest of a known sample and all samples of one object inside the other, the same in all lanes."""
-    search = DepthSearch()
-    search.pose = pose
-    search.inner = inner
-    search.outer = outer
-    search.sampling = sampling
-    search.best = known
+def find_deepest_sample(trees: Trees, room: wp.int32, search: wp.ref[DepthSearch]):
+    """Find the deepest of a known sample and all samples of one object inside the other, the same in all lanes."""
     lists = start_lists(nearest_stack(), room)
-    root = load_node(trees.states, inner.node + 1)
+    root = load_node(trees.states, search.inner.node + 1)
     # A single face waits at once.
     lists.waiting = wp.where(root.face >= 0, 1, 0)
     lists.end = 1 - lists.waiting
@@ -178,32 +153,22 @@ def find_deepest_sample(
         write_bound(lists.items, at, -wp.float32(wp.inf))
     warp_sync()
     search_depth(trees, 0, search, lists)
-    return search.best
 
 
 @wp.func
-def deepest_of_both(
-    trees: Trees,
-    pose: PairPose,
-    solids: Solids,
-    first: Solid,
-    second: Solid,
-    pair: wp.vec2i,
-    room: wp.int32,
-    known: Deepest,
-    sampling: Sampling,
-):
+def deepest_of_both(trees: Trees, solids: Solids, pair: wp.vec2i, room: wp.int32, both: DepthSearch):
     """Return the deepest of a known sample and all samples of either object inside the other, where that is a solid."""
-    best = known
+    search = both
     if solids.is_solid[wp.max(pair[0], pair[1])] != 0:
-        best = find_deepest_sample(trees, pose, first, second, room, known, sampling)
+        find_deepest_sample(trees, room, search)
+    best = search.best
     if solids.is_solid[wp.min(pair[0], pair[1])] != 0:
-        other = Deepest()
-        other.depth = best.depth
-        other.item = KNOWN
-        other = find_deepest_sample(trees, pose, second, first, room, other, sampling)
-        if other.item != KNOWN:
-            best = other
+        search.inner = both.outer
+        search.outer = both.inner
+        search.best.item = KNOWN
+        find_deepest_sample(trees, room, search)
+        if search.best.item != KNOWN:
+            best = search.best
             best.of_b = True
     return best
 
@@ -271,12 +236,12 @@ def find_depth_kernel(
         return
     pose = batch.poses[p]
     scaling = make_scale(trees, pose, a, b)
-    first = make_solid(trees, pose, scaling, False, trees.objects.state[a])
-    second = make_solid(trees, pose, scaling, True, trees.objects.state[b])
-    best = Deepest()
-    best.item = KNOWN
-    sampling = Sampling()
-    sampling.samples = SAMPLES
-    best = deepest_of_both(trees, pose, solids, first, second, batch.pairs[p], room, best, sampling)
+    search = DepthSearch()
+    search.pose = pose
+    search.inner = make_solid(trees, pose, scaling, False, trees.objects.state[a])
+    search.outer = make_solid(trees, pose, scaling, True, trees.objects.state[b])
+    search.best.item = KNOWN
+    search.sampling.samples = SAMPLES
+    best = deepest_of_both(trees, solids, batch.pairs[p], room, search)
     if best.item != KNOWN and warp_lane() == 0:
         report_deepest(trees, pose, scaling, batch.pairs[p], best, p, distances_inout)
