@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import FancyBboxPatch
 
 import warp_abtree as ab
 from warp_abtree.app import scene_geometry as geometry
@@ -186,6 +187,42 @@ def draw_traversal():
     draw(panels, FOLDER / "concept_traversal.png", title, legend, eye, up, 380)
 
 
+# The search.
+
+
+def draw_search():
+    """Lists of a search, and the functions of a policy that take from one and add to the next."""
+    figure = Figure(figsize=(7.6, 2.5))
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, 16.1), ylim=(0, 5))
+    axes.axis("off")
+
+    def box(x, y, title, text, colour):
+        axes.add_patch(FancyBboxPatch((x, y), 2.6, 1.2, "round,pad=0.05", facecolor=colour, edgecolor=INK, lw=0.8))
+        axes.text(x + 1.3, y + 0.8, title, ha="center", va="center", fontweight="bold", color=INK)
+        axes.text(x + 1.3, y + 0.32, text, ha="center", va="center", fontsize=7.5, color=INK)
+
+    def arrow(start, end, bend=0.0, colour=INK):
+        style = {"arrowstyle": "-|>", "color": colour, "lw": 1.0, "connectionstyle": f"arc3,rad={bend}"}
+        axes.annotate("", end, start, arrowprops=style)
+
+    lists = ("node pairs", "a stack"), ("leaf pairs", "until a warp waits"), ("open pairs", "until a warp waits")
+    steps = ("expand", "boxes and slabs drop"), ("leaf", "float32 drops"), ("open", "float64, exact signs")
+    for k, ((name, what), (step, drops)) in enumerate(zip(lists, steps, strict=True)):
+        x = 0.2 + 4.4 * k
+        box(x, 1.9, name, what, "white")
+        box(x + 2.2, 0.2, step, drops, "#dbe7f5")
+        arrow((x + 1.3, 1.85), (x + 2.6, 1.45))
+        arrow((x + 4.3, 1.45), (x + 5.4, 1.85))
+    arrow((2.6, 1.45), (0.9, 1.85), -0.5)
+    box(13.4, 1.9, "report", "what was found", "white")
+    box(5.6, 3.6, "refresh", "what is known by now", "#fbe3dc")
+    arrow((14.7, 3.15), (8.3, 4.2), 0.15, RED)
+    arrow((5.55, 4.2), (2.2, 3.15), 0.15, RED)
+    arrow((6.5, 3.55), (6.1, 3.15), 0, RED)
+    arrow((7.8, 3.55), (9.6, 3.15), 0, RED)
+    save(figure, "concept_search.svg")
+
+
 # The guides: what their samples compute.
 
 
@@ -302,10 +339,22 @@ def draw_places():
     draw(panels, FOLDER / file, title, legend, (0.5, -1, 0.6), (0, 0, 1), 300)
 
 
+def draw_own_query():
+    sample = run_sample("06_your_own_query")
+    plate, near = sample["plate"], sample["near"]
+    panel = panel_of(sample["scene"], "", sample["scene"].poses, query=False)
+    panel.colours[: len(plate.faces)][near.any(axis=0)] = COLOURS[0][1]
+    legend = [(COLOURS[0][0], "plate"), (COLOURS[1][0], "balls"), (COLOURS[0][1], "faces within 0.1 of a ball")]
+    areas = ", ".join(f"{area:.2f}" for area in near @ plate.area_faces)
+    title = f"Areas near the balls: {areas}"
+    draw([panel], FOLDER / "sample_your_own_query.png", title, legend, (0.4, -1, 0.9), (0, 0, 1), 560)
+
+
 def main():
     draw_lods()
     draw_trees()
     draw_traversal()
+    draw_search()
     draw_which_pairs()
     draw_how_far()
     draw_when()
@@ -313,6 +362,7 @@ def main():
     draw_which_lod()
     draw_simulator()
     draw_places()
+    draw_own_query()
 
 
 if __name__ == "__main__":

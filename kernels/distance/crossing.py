@@ -17,7 +17,7 @@ from warp_abtree.kernels.distance.report import Distances, write_nearest
 from warp_abtree.kernels.exact.predicates import EXACT
 from warp_abtree.kernels.intersect.face_pairs import Hits, test_faces
 from warp_abtree.kernels.search.item import DROPPED, FACES, NODES, first_item, four_items, item_first, item_second
-from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM
+from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM, count_to_pop
 from warp_abtree.kernels.search.mean_slabs import Slabs
 from warp_abtree.kernels.search.nearest_stack import nearest_stack, read_bound, write_bound
 from warp_abtree.kernels.search.warp_stack import read_item, write_item
@@ -46,8 +46,7 @@ def search_crossing(trees: Trees, pose: PairPose, scaling: SearchScale, room: wp
     found = NO_FACES
     end = wp.int32(1)
     while end > 0:
-        popped = wp.max(1, (room - DEPTH_FIRST_ROOM - end) >> 2)
-        popped = wp.min(popped, wp.min(warp_size(), end))
+        popped = count_to_pop(room - DEPTH_FIRST_ROOM - end, 2, end)
         # The first of the stack's top to the first lane.
         at = end - 1 - wp.min(warp_lane(), popped - 1)
         end -= popped
@@ -64,10 +63,8 @@ def search_crossing(trees: Trees, pose: PairPose, scaling: SearchScale, room: wp
         live = wp.where(kind == NODES and warp_lane() < first, -1, 0)
         if kind != NODES:
             item = first_item(trees.states, pose)
-        children, kinds, _bounds, _tests = bound_children(
-            False, trees.states, Slabs(), pose, scaling, wp.float32(0.0), item, live
-        )
-        push_in_order(items, end, kinds, children)
+        emitted = bound_children(False, trees.states, Slabs(), pose, scaling, wp.float32(0.0), item, live)
+        push_in_order(items, end, emitted.kinds, emitted.items)
         warp_sync()
     return found
 

@@ -9,20 +9,11 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import StatePool
 from warp_abtree.kernels.base.boxes import PosedBox, pose_box
-from warp_abtree.kernels.base.nodes import Node, load_constant_node
+from warp_abtree.kernels.base.nodes import Node
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.distance.frame import SearchScale
 from warp_abtree.kernels.distance.slab_bound import bound_child_slabs, square_gap
-from warp_abtree.kernels.search.item import (
-    DROPPED,
-    FACES,
-    INDEX_MASK,
-    NODES,
-    four_items,
-    item_first,
-    item_of,
-    item_second,
-)
+from warp_abtree.kernels.search.item import Emitted, count_used, four_items, item_of, kind_of, load_node_pairs
 from warp_abtree.kernels.search.mean_slabs import Slabs
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -56,12 +47,6 @@ def limit_of(scaling: SearchScale, terms: wp.vec4, upper: wp.float32, has_candid
 
 
 @wp.func
-def kind_of(used: wp.int32, a: Node, b: Node, bound: wp.float32, limit: wp.float32):
-    kind = wp.where((a.face | b.face) >= 0, FACES, NODES)
-    return wp.where(used < 0 and bound <= limit, kind, DROPPED)
-
-
-@wp.func
 def bound_child_boxes(pose: PairPose, scaling: SearchScale, a0: Node, a1: Node, b0: Node, b1: Node):
     """Return lower bounds of the squared distances of the four pairs of two nodes of A and two of B."""
     home = wp.transpose(pose.rotation32)
@@ -89,28 +74,21 @@ def bound_children(
     item: wp.int64,
     live: wp.int32,
 ):
-    """Expand an item; return the items that follow, their kinds, their bounds, and how many were compared.
-
-    live is -1, or 0 where nothing is asked of the item, which still names nodes.
-    """
-    x = item_first(item)
-    y = item_second(item)
-    at_a = pose.node_a + (x & INDEX_MASK)
-    at_b = pose.node_b + (y & INDEX_MASK)
-    at = wp.vec4i(at_a, at_a + wp.where(x < 0, 1, 0), at_b, at_b + wp.where(y < 0, 1, 0))
-    a0, a1 = load_constant_node(states, at[0]), load_constant_node(states, at[1])
-    b0, b1 = load_constant_node(states, at[2]), load_constant_node(states, at[3])
-    bounds = wp.vec4()
+    """Expand an item, as `load_node_pairs`; children whose bounds are over a limit are dropped."""
+    pairs = load_node_pairs(states, pose, item, live)
+    a0, a1, b0, b1, used = pairs.a0, pairs.a1, pairs.b0, pairs.b1, pairs.used
+    emitted, bounds = Emitted(), wp.vec4()
     if with_slabs:
-        bounds = bound_child_slabs(slabs, pose, scaling, at, a0, a1, b0, b1)
+        bounds = bound_child_slabs(slabs, pose, scaling, pairs.at, a0, a1, b0, b1)
     else:
         bounds = bound_child_boxes(pose, scaling, a0, a1, b0, b1)
-    kinds = wp.vec4i(
-        kind_of(live, a0, b0, bounds[0], limit),
-        kind_of(y & live, a0, b1, bounds[1], limit),
-        kind_of(x & live, a1, b0, bounds[2], limit),
-        kind_of(x & y & live, a1, b1, bounds[3], limit),
+    emitted.kinds = wp.vec4i(
+        kind_of(used[0], a0, b0, bounds[0] <= limit),
+        kind_of(used[1], a0, b1, bounds[1] <= limit),
+        kind_of(used[2], a1, b0, bounds[2] <= limit),
+        kind_of(used[3], a1, b1, bounds[3] <= limit),
     )
-    items = four_items(item_of(a0, b0), item_of(a0, b1), item_of(a1, b0), item_of(a1, b1))
-    tests = -((live >> 31) + ((y & live) >> 31) + ((x & live) >> 31) + ((x & y & live) >> 31))
-    return items, kinds, bounds, tests
+    emitted.items = four_items(item_of(a0, b0), item_of(a0, b1), item_of(a1, b0), item_of(a1, b1))
+    emitted.bounds = bounds
+    emitted.tests = count_used(used)
+    return emitted

@@ -39,30 +39,19 @@ from warp_abtree.kernels.distance.warp_found import (
     lower_upper,
     offer_nearest,
 )
-from warp_abtree.kernels.intersect.face_pairs import Hits, PairTests
+from warp_abtree.kernels.intersect.face_pairs import Hits
+from warp_abtree.kernels.search.best_first import BestFirstPolicy, Entry, SearchLists, best_first, start_lists
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
-from warp_abtree.kernels.search.load_balance import (
-    DEPTH_FIRST_ROOM,
-    STACK_MASK,
-    Work,
-    await_donation,
-    count_idle,
-    donate_items,
-    load_tickets,
-    receive_items,
-    take_unit,
-)
+from warp_abtree.kernels.search.load_balance import Work, await_donation, receive_items, take_unit
 from warp_abtree.kernels.search.mean_slabs import Slabs, has_mean_slabs
 from warp_abtree.kernels.search.nearest_stack import (
+    NEAREST_MEMORY,
     OPEN_LENGTH,
-    OPEN_START,
     nearest_stack,
-    push_nearest,
     push_open,
-    read_bound,
     write_bound,
 )
-from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item, write_item
+from warp_abtree.kernels.search.warp_stack import write_item
 from warp_abtree.kernels.triangle.corners import load_triangles
 from warp_abtree.kernels.triangle.distance_bounds import bound_faces, load_points
 from warp_abtree.kernels.triangle.triangle_pair import triangle_distance
@@ -78,7 +67,7 @@ MODULE_OPTIONS = native.options(
 wp.set_module_options(MODULE_OPTIONS)
 
 # Fewer items than the traversal gives away: far more lies below one.
-SEARCH_DONATION_LEAST = wp.constant(4)
+SEARCH_DONATION_LEAST = 4
 
 
 # Face pairs from which on it is known whether slabs pay, and items for three of them that they leave where they do.
@@ -88,102 +77,57 @@ DIVE_ITEMS = wp.constant(8)
 
 
 @wp.struct
-class Search:
+class NearestGiven:
+    """What warps that search for nearest faces share."""
+
+    batch: PairBatch  # the object pairs
+    slabs: Slabs  # of their states
+    found: NearestFound  # what they have found
+    work: Work  # what they give away
+
+
+@wp.struct
+class NearestSearch:
     """Search of a warp for the nearest faces of an object pair."""
 
     pair: wp.int32  # its number
     pose: PairPose  # of B in A's frame
     scaling: SearchScale  # how boxes are compared
-    tolerances: Tolerances  # when they are near enough
-    room: wp.int32  # items that the stack takes, STACK_LENGTH at most
-    slabs: wp.bool  # whether there are some of both states
+    terms: wp.vec4  # `tolerance_terms`
+    has_slabs: wp.bool  # whether there are some of both states
+    with_slabs: wp.bool  # whether they count, too
+    has_candidate: wp.bool  # whether there are faces at most as far as `upper`
+    beyond: wp.float32  # bounds under it are of faces that are as near as is asked
+    upper: wp.float32  # scaled distance that the nearest faces are not beyond
+    limit: wp.float32  # bound of node pairs and leaf pairs that matter
+    seen_items: wp.int32  # by all lanes
+    seen_faces: wp.int32  # by all lanes
+    nodes: wp.int32  # pairs of boxes that this lane has compared
+    faces: wp.int32  # pairs of faces that it has measured
 
 
 @wp.func
-def bound_waiting(
-    items: wp.uint64,
-    first: wp.int32,
-    popped: wp.int32,
-    opened: wp.ref[wp.int32],
-    limit: wp.float32,
-    upper: wp.float32,
-    search: Search,
-    trees: Trees,
-    found: NearestFound,
-):
-    """Bound face pairs in float32, one a lane, and keep those that may be nearest; return this lane's tests."""
-    at = STACK_LENGTH + first + wp.min(warp_lane(), popped - 1)
-    item = read_item(items, at)
-    live = warp_lane() < popped and read_bound(items, at) <= limit
-    warp_sync()
-    lower, greatest = wp.float32(wp.inf), wp.float32(wp.inf)
-    if live:
-        pose, scaling = search.pose, search.scaling
-        face_a, face_b = item_first(item), item_second(item)
-        a, b = load_points(trees, pose, scaling.translation, scaling.scale, face_a, face_b)
-        bound_faces(search.scaling.error, a, b, lower, greatest)
-    least = warp_min32(greatest)
-    if least < upper:
-        lower_upper(found.upper, search.pair, UPPER, least)
-    push_open(items, opened, live and lower <= wp.min(least, upper), item, lower)
-    warp_sync()
-    return wp.where(live, 1, 0)
+def refresh_limit(given: NearestGiven, search: wp.ref[NearestSearch], lists: wp.ref[SearchLists]):
+    """Take the least distance that any warp has found; without any, dive: what is measured first lets others drop."""
+    known = load_upper(given.found.upper, search.pair)
+    search.upper = known[UPPER]
+    search.with_slabs = search.has_slabs and known[SLABS_PAY] > 0.0
+    search.has_candidate = search.has_candidate or search.upper < search.beyond
+    search.limit = limit_of(search.scaling, search.terms, search.upper, search.has_candidate)
+    lists.at_once = wp.where(search.has_candidate, warp_size(), wp.min(DIVE_ITEMS, warp_size()))
+    lists.leaf_ready = wp.where(search.has_candidate, warp_size(), 1)
 
 
 @wp.func
-def decide_open(
-    items: wp.uint64,
-    first: wp.int32,
-    popped: wp.int32,
-    upper: wp.float32,
-    pair: wp.int32,
-    trees: Trees,
-    pair_poses: wp.array(dtype=PairPose),
-    found: NearestFound,
-):
-    """Measure in float64 the face pairs that may still be nearest, one a lane.
-
-    The pose in float64 is loaded here, so that the search need not keep it in registers.
-    """
-    at = OPEN_START + first + wp.min(warp_lane(), popped - 1)
-    item = read_item(items, at)
-    live = warp_lane() < popped and read_bound(items, at) <= upper
-    warp_sync()
-    if warp_any(live):
-        d = wp.float64(wp.inf)
-        if live:
-            d = triangle_distance(load_triangles(trees, pair_poses[pair], item_first(item), item_second(item)))
-        least = warp_min(d)
-        lowest = warp_min_item(wp.where(d == least, item, NO_FACES))
-        if least <= load_distance(found.distance, pair):
-            offer_nearest(found.distance, found.faces, pair, least, lowest)
-            lower_upper(found.upper, pair, UPPER, scaled_up(least, found.scaling[pair]))
-
-
-@wp.func
-def expand_nearest(
-    items: wp.uint64,
-    popped: wp.int32,
-    end: wp.ref[wp.int32],
-    waiting: wp.ref[wp.int32],
-    limit: wp.float32,
-    with_slabs: wp.bool,
-    states: StatePool,
-    slabs: Slabs,
-    search: Search,
-):
-    """Expand so many items from the top of the stack, one a lane; return how many pairs of boxes were compared."""
-    end -= popped
-    at = (end + wp.min(warp_lane(), popped - 1)) & STACK_MASK
-    item = read_item(items, at)
-    live = wp.where(warp_lane() < popped and read_bound(items, at) <= limit, -1, 0)
-    warp_sync()
-    children, kinds, bounds, compared = bound_children(
-        with_slabs, states, slabs, search.pose, search.scaling, limit, item, live
+def expand_nearest(trees: Trees, given: NearestGiven, search: wp.ref[NearestSearch], entry: Entry):
+    """Bound the children of node pairs, one a lane."""
+    search.seen_items += entry.count
+    live = wp.where(entry.live and entry.bound <= search.limit, -1, 0)
+    emitted = bound_children(
+        search.with_slabs, trees.states, given.slabs, search.pose, search.scaling, search.limit, entry.item, live
     )
-    push_nearest(items, end, waiting, kinds, children, bounds)
-    warp_sync()
-    return compared
+    search.nodes += emitted.tests
+    return emitted
 
 
 @wp.func
@@ -193,54 +137,74 @@ def slabs_pay(faces: wp.int32, items: wp.int32):
 
 
 @wp.func
-def search_items(
-    search: Search,
-    count: wp.int32,
-    trees: Trees,
-    pair_poses: wp.array(dtype=PairPose),
-    slabs: Slabs,
-    found: NearestFound,
-    work: Work,
+def bound_waiting(
+    trees: Trees, given: NearestGiven, search: wp.ref[NearestSearch], lists: wp.ref[SearchLists], entry: Entry
 ):
-    """Search so many items of the stack, less those donated; return this lane's tests of boxes and of faces."""
-    items, pair, scaling = nearest_stack(), search.pair, search.scaling
-    head, end, waiting, opened = wp.int32(0), wp.int32(count), wp.int32(0), wp.int32(0)
-    tests, seen_items, seen_faces = PairTests(), wp.int32(0), wp.int32(0)
-    has_candidate = load_faces(found.faces, pair) != NO_FACES
-    # Bounds under it are of faces that are as near as is asked.
-    beyond = wp.float32(load_distance(found.distance, pair) * scaling.scale64) * ROUNDING_DOWN
-    terms = tolerance_terms(search.tolerances, scaling)
-    while end > head or waiting > 0 or opened > 0:
-        tickets = load_tickets(work.counter)
-        known = load_upper(found.upper, pair)
-        upper, with_slabs = known[UPPER], search.slabs and known[SLABS_PAY] > 0.0
-        has_candidate = has_candidate or upper < beyond
-        limit = limit_of(scaling, terms, upper, has_candidate)
-        if end > head and waiting < warp_size():
-            # One at a time, depth first, needs little room; more where there is.
-            popped = wp.max(1, (search.room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
-            popped = wp.min(
-                popped, wp.min(wp.where(has_candidate, warp_size(), wp.min(DIVE_ITEMS, warp_size())), end - head)
-            )
-            seen_items += popped
-            tests.nodes += expand_nearest(items, popped, end, waiting, limit, with_slabs, trees.states, slabs, search)
-        # The first face pairs are measured at once: until then, nothing is dropped.
-        if waiting >= warp_size() or (waiting > 0 and (end == head or not has_candidate)):
-            popped = wp.min(waiting, warp_size())
-            waiting -= popped
-            seen_faces += popped
-            if with_slabs and not slabs_pay(seen_faces, seen_items):
-                lower_upper(found.upper, pair, SLABS_PAY, 0.0)
-            tests.faces += bound_waiting(items, waiting, popped, opened, limit, upper, search, trees, found)
-        if opened > OPEN_LENGTH - warp_size() or (opened > 0 and end == head and waiting == 0):
-            popped = wp.min(opened, warp_size())
-            opened -= popped
-            upper = load_upper(found.upper, pair)[UPPER]
-            decide_open(items, opened, popped, upper, pair, trees, pair_poses, found)
-        idle = count_idle(tickets)
-        if idle > 0 and end - head >= 2 * SEARCH_DONATION_LEAST:
-            head = donate_items(SEARCH_DONATION_LEAST, pair, idle, items, head, end, work)
-    return tests
+    """Bound face pairs in float32, one a lane, and keep those that may be nearest."""
+    search.seen_faces += entry.count
+    if search.with_slabs and not slabs_pay(search.seen_faces, search.seen_items):
+        lower_upper(given.found.upper, search.pair, SLABS_PAY, 0.0)
+    live = entry.live and entry.bound <= search.limit
+    lower, greatest = wp.float32(wp.inf), wp.float32(wp.inf)
+    if live:
+        face_a, face_b = item_first(entry.item), item_second(entry.item)
+        a, b = load_points(trees, search.pose, search.scaling.translation, search.scaling.scale, face_a, face_b)
+        bound_faces(search.scaling.error, a, b, lower, greatest)
+    least = warp_min32(greatest)
+    if least < search.upper:
+        lower_upper(given.found.upper, search.pair, UPPER, least)
+    push_open(lists.items, lists.opened, live and lower <= wp.min(least, search.upper), entry.item, lower)
+    search.faces += wp.where(live, 1, 0)
+
+
+@wp.func
+def decide_open(
+    trees: Trees, given: NearestGiven, search: wp.ref[NearestSearch], lists: wp.ref[SearchLists], entry: Entry
+):
+    """Measure in float64 the face pairs that may still be nearest, one a lane.
+
+    The pose in float64 is loaded here, so that the search need not keep it in registers.
+    """
+    found, pair = given.found, search.pair
+    live = entry.live and entry.bound <= load_upper(found.upper, pair)[UPPER]
+    if warp_any(live):
+        d = wp.float64(wp.inf)
+        if live:
+            pose = given.batch.poses[pair]
+            d = triangle_distance(load_triangles(trees, pose, item_first(entry.item), item_second(entry.item)))
+        least = warp_min(d)
+        lowest = warp_min_item(wp.where(d == least, entry.item, NO_FACES))
+        if least <= load_distance(found.distance, pair):
+            offer_nearest(found.distance, found.faces, pair, least, lowest)
+            lower_upper(found.upper, pair, UPPER, scaled_up(least, found.scaling[pair]))
+
+
+search_items_nearest = best_first(
+    BestFirstPolicy(
+        NEAREST_MEMORY,
+        NearestGiven,
+        NearestSearch,
+        refresh_limit,
+        expand_nearest,
+        bound_waiting,
+        decide_open,
+        donates=SEARCH_DONATION_LEAST,
+    )
+)
+
+
+@wp.func
+def start_nearest(p: wp.int32, tolerances: Tolerances, states: StatePool, given: NearestGiven):
+    """Return the search for the nearest faces of an object pair."""
+    search = NearestSearch()
+    search.pair = p
+    search.pose = given.batch.poses[p]
+    search.scaling = given.found.scaling[p]
+    search.terms = tolerance_terms(tolerances, search.scaling)
+    search.has_slabs = has_mean_slabs(states, given.slabs, p)
+    search.has_candidate = load_faces(given.found.faces, p) != NO_FACES
+    search.beyond = wp.float32(load_distance(given.found.distance, p) * search.scaling.scale64) * ROUNDING_DOWN
+    return search
 
 
 @wp.func
@@ -274,9 +238,11 @@ def search_warp_kernel(
     The slabs that were due have been made.
     """
     count = wp.min(batch.count[0], batch.poses.shape[0])
-    search = Search()
-    search.room = room
-    search.tolerances = tolerances
+    given = NearestGiven()
+    given.batch = batch
+    given.slabs = slabs_inout
+    given.found = found_inout
+    given.work = work_inout
     if wp.tid() == 0:
         slabs_inout.due_count[0] = 0
     p = take_unit(work_inout.counter)
@@ -290,14 +256,13 @@ def search_warp_kernel(
             ended = 0
             p = work_inout.owner[slot][0]
         if hits_inout.any_hit[p] == 0:
-            search.pair = p
-            search.pose = batch.poses[p]
-            search.scaling = found_inout.scaling[p]
-            search.slabs = has_mean_slabs(trees.states, slabs_inout, p)
-            size = start_search_items(slot, trees.states, search.pose, work_inout)
-            tests = search_items(search, size, trees, batch.poses, slabs_inout, found_inout, work_inout)
-            add_warp_sum(hits_inout.node_tests, p, tests.nodes)
-            add_warp_sum(hits_inout.triangle_tests, p, tests.faces)
+            search = start_nearest(p, tolerances, trees.states, given)
+            lists = start_lists(nearest_stack(), room)
+            lists.end = start_search_items(slot, trees.states, search.pose, work_inout)
+            lists.open_ready = OPEN_LENGTH - warp_size() + 1
+            search_items_nearest(trees, given, search, lists)
+            add_warp_sum(hits_inout.node_tests, p, search.nodes)
+            add_warp_sum(hits_inout.triangle_tests, p, search.faces)
         ended += 1
         p = count
         if slot < 0:

@@ -40,31 +40,36 @@ from warp_abtree.kernels.inside.samples import (
     sample_weights,
 )
 from warp_abtree.kernels.intersect.face_pairs import Hits
-from warp_abtree.kernels.search.item import FACES, NODES, four_items, item_first, item_second, pack_item
-from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM
-from warp_abtree.kernels.search.nearest_stack import nearest_stack, push_nearest, read_bound, write_bound
-from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item, write_item
+from warp_abtree.kernels.search.best_first import BestFirstPolicy, Entry, SearchLists, best_first, start_lists
+from warp_abtree.kernels.search.item import FACES, NODES, Emitted, item_first, item_second, pack_item
+from warp_abtree.kernels.search.nearest_stack import NEAREST_MEMORY, nearest_stack, write_bound
+from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, write_item
 
-MODULE_OPTIONS = native.options("base/lanes.cuh", "exact/determinant.cuh", "search/nearest_stack.cuh")
+MODULE_OPTIONS = native.options(
+    "base/lanes.cuh", "exact/determinant.cuh", "search/load_balance.cuh", "search/nearest_stack.cuh"
+)
 wp.set_module_options(MODULE_OPTIONS)
 
 
+@wp.struct
+class DepthSearch:
+    """Search for the deepest sample of one object inside the other."""
+
+    pose: PairPose  # of B in A's frame
+    inner: Solid  # whose samples are looked at
+    outer: Solid  # what they are inside
+    sampling: Sampling  # which of them count
+    best: Deepest  # so far, the same in all lanes
+
+
 @wp.func
-def bound_depth(
-    trees: Trees,
-    pose: PairPose,
-    inner: Solid,
-    outer: Solid,
-    node: Node,
-    hint: wp.int32,
-    known: wp.float64,
-    sampling: Sampling,
-):
+def bound_depth(trees: Trees, search: DepthSearch, node: Node, hint: wp.int32):
     """Return an upper bound of the depth below a node, negative only if less than what is known, and a face.
 
     With the node's middle at a distance d from the surface, and points within r of it, an inside point is no deeper
     than d + r, and no deeper than r - d where the middle is outside: the surface lies between them.
     """
+    pose, inner, outer, known = search.pose, search.inner, search.outer, search.best.depth
     none = -wp.float64(1.0)
     if node.skip < 0:
         return none, hint
@@ -73,7 +78,7 @@ def bound_depth(
     if inner.of_b:
         middle = pose_point(pose.rotation, pose.translation, middle)
     reach = wp.length(HALF * (upper - lower)) * outer.grow + outer.margin
-    if is_avoided(sampling, middle, reach):
+    if is_avoided(search.sampling, middle, reach):
         return none, hint
     # What is inside lies within the root's box, and no deeper than its nearest side.
     root = load_node(trees.states, outer.node + 1)
@@ -95,92 +100,75 @@ def bound_depth(
 
 
 @wp.func
-def agree(best: Deepest):
-    """Return the deepest sample of all lanes, the lowest of several."""
-    found = Deepest()
-    found.depth = warp_max(best.depth)
-    found.item = warp_min_item(wp.where(best.depth == found.depth, best.item, NO_SAMPLE))
-    return found
+def expand_node(trees: Trees, given: wp.int32, search: wp.ref[DepthSearch], entry: Entry):
+    """Bound the samples below both children of a node; its item names the outer face that was nearest above it, too."""
+    emitted = Emitted()
+    live = entry.live and wp.float64(-entry.bound) >= search.best.depth
+    emitted.tests = wp.where(live, 2, 0)
+    for k in range(2):
+        child = load_node(trees.states, search.inner.node + wp.where(live, 2 * item_first(entry.item) + k, 1))
+        if live:
+            bound, near = bound_depth(trees, search, child, item_second(entry.item))
+            if bound >= wp.float64(0.0):
+                emitted.kinds[k] = wp.where(child.face >= 0, FACES, NODES)
+                emitted.items[k] = pack_item(wp.where(child.face >= 0, child.face, child.skip), near)
+                emitted.bounds[k] = -round_up(bound)
+    return emitted
 
 
 @wp.func
-def find_deepest_sample(
-    trees: Trees, pose: PairPose, inner: Solid, outer: Solid, room: wp.int32, known: Deepest, sampling: Sampling
-):
-    """Return the deepest of a known sample and all samples of one object inside the other, the same in all lanes.
-
-    The children that may be deepest come first; faces wait until there is one for each lane. An item names a node or a
-    face, and the outer face that was nearest above it, where the next search starts.
-    """
-    best = known
-    items = nearest_stack()
-    root = load_node(trees.states, inner.node + 1)
-    # A single face waits at once.
-    waiting = wp.where(root.face >= 0, 1, 0)
-    end = 1 - waiting
-    if warp_lane() == 0:
-        at = STACK_LENGTH * waiting
-        write_item(items, at, pack_item(wp.where(root.face >= 0, root.face, root.skip), NO_NEAREST))
-        write_bound(items, at, -wp.float32(wp.inf))
-    warp_sync()
-    while end > 0 or waiting > 0:
-        if end > 0 and waiting < warp_size():
-            popped = wp.max(1, (room - DEPTH_FIRST_ROOM - end) >> 1)
-            popped = wp.min(popped, wp.min(warp_size(), end))
-            end -= popped
-            at = end + wp.min(warp_lane(), popped - 1)
-            item = read_item(items, at)
-            node = item_first(item)
-            live = warp_lane() < popped and wp.float64(-read_bound(items, at)) >= best.depth
-            warp_sync()
-            children, kinds, bounds = four_items(), wp.vec4i(), wp.vec4()
-            for k in range(2):
-                child = load_node(trees.states, inner.node + wp.where(live, 2 * node + k, 1))
-                if live:
-                    near = item_second(item)
-                    bound, near = bound_depth(trees, pose, inner, outer, child, near, best.depth, sampling)
-                    if bound >= wp.float64(0.0):
-                        kinds[k] = wp.where(child.face >= 0, FACES, NODES)
-                        children[k] = pack_item(wp.where(child.face >= 0, child.face, child.skip), near)
-                        bounds[k] = -round_up(bound)
-            push_nearest(items, end, waiting, kinds, children, bounds)
-            warp_sync()
-        if waiting >= warp_size() or (waiting > 0 and end == 0):
-            popped = wp.min(waiting, warp_size())
-            waiting -= popped
-            at = STACK_LENGTH + waiting + wp.min(warp_lane(), popped - 1)
-            item = read_item(items, at)
-            if warp_lane() < popped and wp.float64(-read_bound(items, at)) >= best.depth:
-                face, near = item_first(item), item_second(item)
-                best = measure_samples(trees, pose, inner, outer, face, near, best, sampling)
-            warp_sync()
-            best = agree(best)
-    return best
-
-
-@wp.func
-def deepest_of_both(
+def measure_face(
     trees: Trees,
-    pose: PairPose,
-    solids: Solids,
-    first: Solid,
-    second: Solid,
-    pair: wp.vec2i,
-    room: wp.int32,
-    known: Deepest,
-    sampling: Sampling,
+    given: wp.int32,
+    search: wp.ref[DepthSearch],
+    lists: wp.ref[SearchLists],
+    entry: Entry,
 ):
+    """Measure the samples of a face, one a lane, and take the deepest of all lanes, the lowest of several."""
+    best = search.best
+    if entry.live and wp.float64(-entry.bound) >= best.depth:
+        face, near = item_first(entry.item), item_second(entry.item)
+        best = measure_samples(trees, search.pose, search.inner, search.outer, face, near, best, search.sampling)
+    warp_sync()
+    search.best.depth = warp_max(best.depth)
+    search.best.item = warp_min_item(wp.where(best.depth == search.best.depth, best.item, NO_SAMPLE))
+
+
+search_depth = best_first(
+    BestFirstPolicy(NEAREST_MEMORY, wp.int32, DepthSearch, None, expand_node, measure_face, measure_face, shift=1)
+)
+
+
+@wp.func
+def find_deepest_sample(trees: Trees, room: wp.int32, search: wp.ref[DepthSearch]):
+    """Find the deepest of a known sample and all samples of one object inside the other, the same in all lanes."""
+    lists = start_lists(nearest_stack(), room)
+    root = load_node(trees.states, search.inner.node + 1)
+    # A single face waits at once.
+    lists.waiting = wp.where(root.face >= 0, 1, 0)
+    lists.end = 1 - lists.waiting
+    if warp_lane() == 0:
+        at = STACK_LENGTH * lists.waiting
+        write_item(lists.items, at, pack_item(wp.where(root.face >= 0, root.face, root.skip), NO_NEAREST))
+        write_bound(lists.items, at, -wp.float32(wp.inf))
+    warp_sync()
+    search_depth(trees, 0, search, lists)
+
+
+@wp.func
+def deepest_of_both(trees: Trees, solids: Solids, pair: wp.vec2i, room: wp.int32, both: DepthSearch):
     """Return the deepest of a known sample and all samples of either object inside the other, where that is a solid."""
-    best = known
+    search = both
     if solids.is_solid[wp.max(pair[0], pair[1])] != 0:
-        best = find_deepest_sample(trees, pose, first, second, room, known, sampling)
+        find_deepest_sample(trees, room, search)
+    best = search.best
     if solids.is_solid[wp.min(pair[0], pair[1])] != 0:
-        other = Deepest()
-        other.depth = best.depth
-        other.item = KNOWN
-        other = find_deepest_sample(trees, pose, second, first, room, other, sampling)
-        if other.item != KNOWN:
-            best = other
+        search.inner = both.outer
+        search.outer = both.inner
+        search.best.item = KNOWN
+        find_deepest_sample(trees, room, search)
+        if search.best.item != KNOWN:
+            best = search.best
             best.of_b = True
     return best
 
@@ -248,12 +236,12 @@ def find_depth_kernel(
         return
     pose = batch.poses[p]
     scaling = make_scale(trees, pose, a, b)
-    first = make_solid(trees, pose, scaling, False, trees.objects.state[a])
-    second = make_solid(trees, pose, scaling, True, trees.objects.state[b])
-    best = Deepest()
-    best.item = KNOWN
-    sampling = Sampling()
-    sampling.samples = SAMPLES
-    best = deepest_of_both(trees, pose, solids, first, second, batch.pairs[p], room, best, sampling)
+    search = DepthSearch()
+    search.pose = pose
+    search.inner = make_solid(trees, pose, scaling, False, trees.objects.state[a])
+    search.outer = make_solid(trees, pose, scaling, True, trees.objects.state[b])
+    search.best.item = KNOWN
+    search.sampling.samples = SAMPLES
+    best = deepest_of_both(trees, solids, batch.pairs[p], room, search)
     if best.item != KNOWN and warp_lane() == 0:
         report_deepest(trees, pose, scaling, batch.pairs[p], best, p, distances_inout)

@@ -18,7 +18,7 @@ from warp_abtree.kernels.contacts.points import order_direction
 from warp_abtree.kernels.distance.frame import make_scale
 from warp_abtree.kernels.inside.components import Solids
 from warp_abtree.kernels.inside.containment import FIRST_INSIDE, SECOND_INSIDE
-from warp_abtree.kernels.inside.depth import MODULE_OPTIONS, deepest_of_both, deepest_points
+from warp_abtree.kernels.inside.depth import MODULE_OPTIONS, DepthSearch, deepest_of_both, deepest_points
 from warp_abtree.kernels.inside.nearest_face import NO_NEAREST, Solid, make_solid, nearest_face
 from warp_abtree.kernels.inside.parity import is_inside
 from warp_abtree.kernels.inside.samples import AVOIDED_MAX, KNOWN, Deepest, Sampling, way_out
@@ -171,12 +171,17 @@ def add_inside_point_kernel(
     normals = wp.transpose(trees.objects.rotation[a]) * way_of_points(manifolds_inout, p)
     sampling.way = way_of_second(trees, pose, first, second, hits.any_hit[p], normals)
     along = order_direction(trees.objects.rotation[a])
+    search = DepthSearch()
+    search.pose = pose
+    search.inner = first
+    search.outer = second
     searching = bool(True)
     while searching:
-        best = Deepest()
-        best.item = KNOWN
-        best.depth = least
-        best = deepest_of_both(trees, pose, solids, first, second, batch.pairs[p], room, best, sampling)
+        search.best = Deepest()
+        search.best.item = KNOWN
+        search.best.depth = least
+        search.sampling = sampling
+        best = deepest_of_both(trees, solids, batch.pairs[p], room, search)
         searching = best.item != KNOWN
         if searching:
             point, sample, foot = deepest_points(trees, pose, batch.pairs[p], best)

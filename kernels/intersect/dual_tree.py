@@ -1,4 +1,4 @@
-"""Face pairs that intersect, are nearer than a gap, or are not proved apart: policies of the search by warps."""
+"""Face pairs that intersect, or are nearer than a gap: policies of the search by warps."""
 
 import functools
 
@@ -35,7 +35,7 @@ def add_pair_tests(pair: wp.int32, tests: TraversalTests, found: Hits):
 
 @functools.cache
 def hit_policy(mode: int, for_any: bool) -> WarpPolicy:
-    """Return the policy at a precision, for WITHIN or for GAP.
+    """Return the policy at a precision, or for GAP.
 
     One for OUTPUT_ANY and one for the other outputs, each with what it takes as constants. Uncertain face pairs wait
     for passes of their own.
@@ -87,5 +87,5 @@ def hit_policy(mode: int, for_any: bool) -> WarpPolicy:
 
 
 def warp_traversal(mode: int, for_any: bool):
-    """Return the kernel that has warps share the object pairs, at a precision, for WITHIN or for GAP."""
+    """Return the kernel that has warps share the object pairs, at a precision, or for GAP."""
     return warp_search(hit_policy(mode, for_any))

@@ -7,7 +7,6 @@ from warp_abtree.kernels.base.boxes import map_point
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.exact.predicates import FLOAT32, UNCERTAIN
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair, load_near
-from warp_abtree.kernels.triangle.distance import triangles_near
 from warp_abtree.kernels.triangle.float32_filter import (
     FLOAT32_UNIT,
     are_uncertain,
@@ -24,9 +23,7 @@ OUTPUT_ANY = wp.constant(0)
 OUTPUT_COUNT = wp.constant(1)
 OUTPUT_FACES = wp.constant(2)
 
-# In place of a precision: faces count as met unless proved farther apart than a distance.
-WITHIN = wp.constant(-1)
-# EXACT, and face pairs that are apart by less than a gap are listed too.
+# In place of a precision: EXACT, and face pairs that are apart by less than a gap are listed too.
 GAP = wp.constant(-2)
 
 # On the pair of a face pair in `Hits.face`: it is apart.
@@ -98,7 +95,7 @@ def scaled_gap(pose: PairPose):
 @wp.func
 def face_plane_signs(mode: wp.int32, trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
     """Return SEPARATED where the plane of one of two active faces separates them in float32, else the signs."""
-    if mode == WITHIN or (mode != FLOAT32 and pose.error == wp.inf):
+    if mode != FLOAT32 and pose.error == wp.inf:
         return 0
     a = load_corner_ids(trees.states, pose.corner_a + face_a)
     b = load_corner_ids(trees.states, pose.corner_b + face_b)
@@ -137,25 +134,6 @@ def test_faces(mode: wp.int32, trees: Trees, pose: PairPose, face_a: wp.int32, f
         s = pose.scale
         return decide_triangles(mode, a0 * s, a1 * s, a2 * s, b0 * s, b1 * s, b2 * s)
     return decide_triangles(mode, a0, a1, a2, b0, b1, b2)
-
-
-@wp.func
-def faces_near(trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
-    """Return 1 unless the faces are proved farther apart than `within`, in float64; then 0."""
-    a = trees.states.face_corner[pose.corner_a + face_a]
-    b = trees.states.face_corner[pose.corner_b + face_b]
-    a0, a1, a2, b0, b1, b2 = load_face_pair(trees.models, pose, a, b)
-    return triangles_near(pose.within, a0, a1, a2, b0, b1, b2)
-
-
-@wp.func
-def try_straddling_faces(
-    mode: wp.int32, trees: Trees, pose: PairPose, face_a: wp.int32, face_b: wp.int32, signs: wp.int32
-):
-    """Return whether straddling faces meet in the first stage: 1, 0 or UNCERTAIN; for WITHIN, in all stages."""
-    if mode == WITHIN:
-        return faces_near(trees, pose, face_a, face_b)
-    return intersect_straddling_faces(mode, trees, pose, face_a, face_b, signs)
 
 
 @wp.func

@@ -17,9 +17,9 @@ from warp_abtree.kernels.intersect.face_pairs import (
     Hits,
     defer_uncertain,
     face_plane_signs,
+    intersect_straddling_faces,
     list_apart,
     report_hit,
-    try_straddling_faces,
 )
 from warp_abtree.kernels.search.item import item_first, item_second
 from warp_abtree.kernels.search.warp_stack import (
@@ -73,7 +73,7 @@ def test_straddling(
     at = own.straddling + wp.min(lane, popped - 1)
     item = read_item(own.items, STRADDLING_START + at)
     signs = read_signs(own.items, at)
-    meet = try_straddling_faces(mode, trees, pose, item_first(item), item_second(item), signs)
+    meet = intersect_straddling_faces(mode, trees, pose, item_first(item), item_second(item), signs)
     if mode == GAP:
         apart = meet == 0 and lane < popped
         slot = reserve_slot(hits.apart_total, apart)

@@ -1,4 +1,4 @@
-"""Face pairs that intersect, are nearer than a gap, or are not proved apart: policies of the search by threads."""
+"""Face pairs that intersect, or are nearer than a gap: policies of the search by threads."""
 
 import functools
 
@@ -13,9 +13,7 @@ from warp_abtree.kernels.intersect.face_pairs import (
     GAP,
     OUTPUT_ANY,
     OUTPUT_FACES,
-    WITHIN,
     Hits,
-    faces_near,
     float32_bounds,
     report_hit,
     scaled_gap,
@@ -114,12 +112,7 @@ def resolve_faces(
         if output != OUTPUT_ANY or met == 0:
             item = faces[i]
             tested += 1
-            meets = wp.int32(0)
-            if mode == WITHIN:
-                meets = faces_near(trees, pose, item_first(item), item_second(item))
-            else:
-                meets = test_faces(mode, trees, pose, item_first(item), item_second(item))
-            if meets == 1:
+            if test_faces(mode, trees, pose, item_first(item), item_second(item)) == 1:
                 met_inout[met] = item
                 met += 1
     return wp.int64(tested)
@@ -170,9 +163,6 @@ def test_leaf_pairs(
     tests: wp.ref[FaceTests],
 ):
     """Test leaf pairs in all stages; those that met stand in front of the list then."""
-    if mode == WITHIN:
-        tests.total += resolve_faces(mode, output, trees, pose, waiting, faces, found.met, faces)
-        return
     error, unit = float32_bounds(mode, pose)
     bounds, for_any = wp.vec3(error, unit, -1.0), output == OUTPUT_ANY
     simd_float32_filter(trees.models, trees.states, pose, bounds, for_any, waiting, faces, uncertain, uncertain, found)
@@ -221,8 +211,8 @@ def report_met(
 
 @functools.cache
 def thread_policy(mode: int) -> ThreadPolicy:
-    """Return the policy at a precision, for WITHIN or for GAP."""
-    with_gap, within = mode == int(GAP), mode == int(WITHIN)
+    """Return the policy at a precision, or for GAP."""
+    with_gap = mode == int(GAP)
 
     @wp.func
     def test(
@@ -245,10 +235,10 @@ def thread_policy(mode: int) -> ThreadPolicy:
             test_leaf_pairs(wp.static(mode), output, trees, pose, waiting, faces, uncertain, found, tests)
         return report_met(output, pair, pose.swapped, found.met, faces, hits, tests)
 
-    start = pairs_starter(with_gap or within)
-    return ThreadPolicy(HIT_FILTERS, not within, with_gap, Hits, start, test, write_counts)
+    start = pairs_starter(with_gap)
+    return ThreadPolicy(HIT_FILTERS, True, with_gap, Hits, start, test, write_counts)
 
 
 def thread_traversal(mode: int):
-    """Return the kernel whose threads share the object pairs, at a precision, for WITHIN or for GAP."""
+    """Return the kernel whose threads share the object pairs, at a precision, or for GAP."""
     return thread_search(thread_policy(mode), int(OUTPUT_ANY))

@@ -5,7 +5,6 @@ step by step, each with 31 others, since a step takes as long as its slowest lan
 """
 
 from functools import cache
-from typing import Any
 
 import warp as wp
 
@@ -29,12 +28,19 @@ from warp_abtree.kernels.motion.face_pair import (
 from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
 from warp_abtree.kernels.motion.linear import EndPoses
 from warp_abtree.kernels.motion.start import OPEN, FirstContacts
-from warp_abtree.kernels.search.item import FACES, NODES, first_item, four_items, item_first, item_second
-from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM
+from warp_abtree.kernels.search.best_first import BestFirstPolicy, Entry, SearchLists, best_first, start_lists
+from warp_abtree.kernels.search.item import Emitted, first_item, item_first, item_second
+from warp_abtree.kernels.search.nearest_stack import SearchMemory
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item
 
 MODULE_OPTIONS = native.options(
-    "base/counters.cuh", "base/lanes.cuh", "exact/apart_until.cuh", "exact/determinant.cuh", "search/motion_stack.cuh"
+    "base/counters.cuh",
+    "base/lanes.cuh",
+    "exact/apart_until.cuh",
+    "exact/determinant.cuh",
+    "search/load_balance.cuh",
+    "search/motion_stack.cuh",
+    "search/nearest_stack.cuh",
 )
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -68,6 +74,23 @@ def write_time(items: wp.uint64, i: wp.int32, time: wp.float64):
     """Write the time of the i-th face pair that goes on."""
 
 
+MOTION_MEMORY = SearchMemory(MOTION_STACK_LENGTH, GOING_START, -1, read_tag, read_slot, write_entry)
+
+
+@cache
+def motion_given(kind):
+    """Return the struct of what searches for first contacts are given, for motions of a kind."""
+
+    @wp.struct
+    class MotionGiven:
+        tolerance: wp.float64  # of times
+        batch: PairBatch  # the object pairs
+        poses: EndPoses  # of objects
+        motion: wp.array(dtype=kind)  # of each object pair
+
+    return MotionGiven
+
+
 @wp.struct
 class Group:
     """Object pairs that a warp searches, a slot each."""
@@ -94,38 +117,6 @@ def count_in(counts: wp.ref[wp.vec4i], slot: wp.int32, more: wp.int32):
 
 
 @wp.func
-def push_steps(
-    items: wp.uint64,
-    ends: wp.vec2i,
-    slot: wp.int32,
-    given_kinds: wp.vec4i,
-    given: four_items,
-    given_times: wp.vec4,
-):
-    """Append node pairs to the stack, the earliest of each lane last, and face pairs to theirs; return both ends."""
-    kinds, children, times = given_kinds, given, given_times
-    for n in range(5):
-        i, j = wp.static((0, 2, 0, 1, 1)[n]), wp.static((1, 3, 2, 3, 2)[n])
-        turn = times[i] < times[j]
-        t, u = times[i], times[j]
-        c, d = children[i], children[j]
-        k, m = kinds[i], kinds[j]
-        times[i] = wp.where(turn, u, t)
-        times[j] = wp.where(turn, t, u)
-        children[i] = wp.where(turn, d, c)
-        children[j] = wp.where(turn, c, d)
-        kinds[i] = wp.where(turn, m, k)
-        kinds[j] = wp.where(turn, k, m)
-    end, waiting = wp.int32(ends[0]), wp.int32(ends[1])
-    for k in range(4):
-        node, face = kinds[k] == NODES, kinds[k] == FACES
-        place, face_place = next_place(end, node), MOTION_STACK_LENGTH + next_place(waiting, face)
-        if node or face:
-            write_entry(items, wp.where(node, place, face_place), children[k], times[k], slot)
-    return wp.vec2i(end, waiting)
-
-
-@wp.func
 def take_contacts(group: wp.ref[Group], slot: wp.int32, own: FirstContact):
     """Take the earliest of the contacts of all lanes."""
     time = wp.where(own.end == CLEAR or own.end == IN_PROGRESS, wp.float64(wp.inf), own.time)
@@ -139,57 +130,52 @@ def take_contacts(group: wp.ref[Group], slot: wp.int32, own: FirstContact):
             group.end[k] = wp.where(touches, TOUCHES, UNDECIDED)
 
 
-@wp.func
-def advance_face_pairs(
-    items: wp.uint64,
-    ends: wp.vec3i,
-    mode: wp.int32,
-    tolerance: wp.float64,
-    trees: Trees,
-    poses: EndPoses,
-    pair_poses: wp.array(dtype=PairPose),
-    motion: Any,
-    before: Group,
-):
-    """Advance face pairs, one a lane; return the group with their contacts, and the lists' ends.
+@cache
+def group_policy(kind) -> BestFirstPolicy:
+    """Return the policy of warps for motions of a kind."""
+    given_type = motion_given(kind)
 
-    Args:
-        mode: ONE_STEP for those that go on, NORMALS for those that wait.
-    """
-    group = before
-    waiting, going = wp.int32(ends[1]), wp.int32(ends[2])
-    popped = wp.min(wp.where(mode == ONE_STEP, going, waiting), warp_size())
-    lane = wp.min(warp_lane(), popped - 1)
-    progress = PairProgress()
-    progress.mode = mode
-    at = wp.int32(0)
-    if mode == ONE_STEP:
-        going -= popped
-        at = GOING_START + going + lane
-        progress.time = wp.cast(read_item(items, TIMES_START + going + lane), wp.float64)
-        progress.steps = wp.int32(read_tag(items, at))
-    else:
-        waiting -= popped
-        at = MOTION_STACK_LENGTH + waiting + lane
-        progress.time = wp.float64(read_tag(items, at))
-    item, slot = read_item(items, at), read_slot(items, at)
-    best = time_of(group, slot)
-    live = warp_lane() < popped and progress.time <= best
-    warp_sync()
-    own, steps = FirstContact(), wp.int32(0)
-    if live:
-        p = group.first + slot
-        faces = wp.vec2i(item_first(item), item_second(item))
-        own, steps = advance_faces(tolerance, trees, poses, pair_poses[p], motion[p], faces, progress, best)
-    count_in(group.faces, slot, wp.where(live and mode != ONE_STEP, 1, 0))
-    take_contacts(group, slot, own)
-    goes_on = own.end == IN_PROGRESS and own.time <= time_of(group, slot)
-    place = next_place(going, goes_on)
-    if goes_on:
-        write_entry(items, GOING_START + place, item, wp.float32(steps), slot)
-        write_time(items, place, own.time)
-    warp_sync()
-    return group, wp.vec3i(ends[0], waiting, going)
+    @wp.func
+    def expand(trees: Trees, given: given_type, group: wp.ref[Group], entry: Entry):
+        """Advance the children of node pairs, one a lane."""
+        p, best = group.first + entry.slot, time_of(group, entry.slot)
+        live = wp.where(entry.live and wp.float64(entry.bound) <= best, -1, 0)
+        emitted = Emitted()
+        if warp_any(live < 0):
+            emitted = advance_nodes(
+                trees.states, given.batch.poses[p], given.motion[p], entry.bound, best, entry.item, live
+            )
+        count_in(group.nodes, entry.slot, emitted.tests)
+        return emitted
+
+    @wp.func
+    def advance(trees: Trees, given: given_type, group: wp.ref[Group], lists: wp.ref[SearchLists], entry: Entry):
+        """Advance face pairs, one a lane: those that wait by normals, those that go on by a step."""
+        goes_on = entry.at >= GOING_START
+        progress = PairProgress()
+        progress.mode = wp.where(goes_on, ONE_STEP, NORMALS)
+        progress.time = wp.float64(entry.bound)
+        if goes_on:
+            progress.time = wp.cast(read_item(lists.items, TIMES_START + entry.at - GOING_START), wp.float64)
+            progress.steps = wp.int32(entry.bound)
+        best = time_of(group, entry.slot)
+        live = entry.live and progress.time <= best
+        own, steps = FirstContact(), wp.int32(0)
+        if live:
+            p = group.first + entry.slot
+            faces = wp.vec2i(item_first(entry.item), item_second(entry.item))
+            own, steps = advance_faces(
+                given.tolerance, trees, given.poses, given.batch.poses[p], given.motion[p], faces, progress, best
+            )
+        count_in(group.faces, entry.slot, wp.where(live and not goes_on, 1, 0))
+        take_contacts(group, entry.slot, own)
+        more = own.end == IN_PROGRESS and own.time <= time_of(group, entry.slot)
+        place = next_place(lists.opened, more)
+        if more:
+            write_entry(lists.items, GOING_START + place, entry.item, wp.float32(steps), entry.slot)
+            write_time(lists.items, place, own.time)
+
+    return BestFirstPolicy(MOTION_MEMORY, given_type, Group, None, expand, advance, advance, turns=True)
 
 
 @wp.func
@@ -218,51 +204,11 @@ def start_group(
     return group, end
 
 
-@wp.func
-def search_group(
-    items: wp.uint64,
-    room: wp.int32,
-    tolerance: wp.float64,
-    trees: Trees,
-    poses: EndPoses,
-    pair_poses: wp.array(dtype=PairPose),
-    motion: Any,
-    begun: Group,
-    roots: wp.int32,
-):
-    """Return a group with its first contacts."""
-    group = begun
-    ends = wp.vec3i(roots, 0, 0)
-    while ends[0] > 0 or ends[1] > 0 or ends[2] > 0:
-        if ends[0] > 0 and ends[1] < warp_size() and ends[2] < warp_size():
-            # One at a time, depth first, needs little room; more where there is.
-            popped = wp.max(1, (room - DEPTH_FIRST_ROOM - ends[0]) >> 2)
-            popped = wp.min(popped, wp.min(warp_size(), ends[0]))
-            end = ends[0] - popped
-            at = end + wp.min(warp_lane(), popped - 1)
-            item, t, slot = read_item(items, at), read_tag(items, at), read_slot(items, at)
-            p, best = group.first + slot, time_of(group, slot)
-            live = wp.where(warp_lane() < popped and wp.float64(t) <= best, -1, 0)
-            warp_sync()
-            children, kinds, times, compared = four_items(), wp.vec4i(), wp.vec4(), wp.int32(0)
-            if warp_any(live < 0):
-                children, kinds, times, compared = advance_nodes(
-                    trees.states, pair_poses[p], motion[p], t, best, item, live
-                )
-            pushed = push_steps(items, wp.vec2i(end, ends[1]), slot, kinds, children, times)
-            warp_sync()
-            ends = wp.vec3i(pushed[0], pushed[1], ends[2])
-            count_in(group.nodes, slot, compared)
-        mode = wp.where(ends[2] >= warp_size() or ends[1] == 0, ONE_STEP, NORMALS)
-        most = wp.where(mode == ONE_STEP, ends[2], ends[1])
-        if most >= warp_size() or (ends[0] == 0 and most > 0):
-            group, ends = advance_face_pairs(items, ends, mode, tolerance, trees, poses, pair_poses, motion, group)
-    return group
-
-
 @cache
 def warp_motion_search(kind):
     """Return the kernel of warps for motions of a kind: `path.Motion` or `linear.LinearMotion`."""
+    policy = group_policy(kind)
+    search_group, given_type = best_first(policy), policy.given
 
     # Fourteen warps a multiprocessor hide more of what loads wait for than spilled registers cost.
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, launch_bounds=(32, 14))
@@ -282,12 +228,17 @@ def warp_motion_search(kind):
         first = size * (wp.tid() / warp_size())
         if first >= count or batch.launched[0] == STALE:
             return
-        items = motion_stack()
-        group, roots = start_group(items, first, size, count, trees.states, batch.poses, contacts_inout)
+        lists = start_lists(motion_stack(), wp.where(room < STACK_LENGTH, room, MOTION_STACK_LENGTH))
+        group, roots = start_group(lists.items, first, size, count, trees.states, batch.poses, contacts_inout)
         if roots == 0:
             return
-        stack_room = wp.where(room < STACK_LENGTH, room, MOTION_STACK_LENGTH)
-        group = search_group(items, stack_room, tolerance, trees, poses, batch.poses, motion, group, roots)
+        lists.end = roots
+        given = given_type()
+        given.tolerance = tolerance
+        given.batch = batch
+        given.poses = poses
+        given.motion = motion
+        search_group(trees, given, group, lists)
         for k in range(4):
             p = first + k
             if k < size and p < count:

@@ -57,8 +57,7 @@ def advance_nodes(
 ):
     """Expand an item from time t on, see `node_pair.advance_children`."""
     boxes = box_motion(motion, place_motion(motion, wp.float64(t)))
-    items, kinds, times, tests = advance_children(states, pose, motion, boxes, t, best, item, live)
-    return items, kinds, times, tests
+    return advance_children(states, pose, motion, boxes, t, best, item, live)
 
 
 @wp.func
@@ -71,8 +70,7 @@ def advance_nodes(  # noqa: F811
     item: wp.int64,
     live: wp.int32,
 ):
-    items, kinds, times, tests = advance_linear_children(states, pose, motion, t, best, item, live)
-    return items, kinds, times, tests
+    return advance_linear_children(states, pose, motion, t, best, item, live)
 
 
 @wp.func

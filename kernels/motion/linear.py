@@ -12,7 +12,7 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, StatePool, Trees
 from warp_abtree.kernels.base.boxes import pose_box
-from warp_abtree.kernels.base.nodes import Node, load_constant_node, load_node
+from warp_abtree.kernels.base.nodes import Node, load_node
 from warp_abtree.kernels.base.poses import ROUNDING_32, SCALE_MAX, PairPose, reach_box
 from warp_abtree.kernels.motion.face_pair import (
     AXIS_COUNT,
@@ -28,10 +28,10 @@ from warp_abtree.kernels.motion.face_pair import (
     step_along,
     time_after,
 )
-from warp_abtree.kernels.motion.node_pair import go_on, later, longest_step
+from warp_abtree.kernels.motion.node_pair import emit_later, longest_step
 from warp_abtree.kernels.motion.path import BEND_LEAST
 from warp_abtree.kernels.motion.stalled import plain_row, posed_row, resolve_in_double_words, words_type
-from warp_abtree.kernels.search.item import INDEX_MASK, four_items, item_first, item_second
+from warp_abtree.kernels.search.item import load_node_pairs
 from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, POSE_ROUNDING, corners_type, largest_coordinate
 from warp_abtree.kernels.triangle.float64_filter import float64_filter_triangles
 
@@ -184,12 +184,8 @@ def advance_linear_children(
     live: wp.int32,
 ):
     """Expand an item from time t on, as `node_pair.advance_children`."""
-    x, y = item_first(item), item_second(item)
-    at_a, at_b = pose.node_a + (x & INDEX_MASK), pose.node_b + (y & INDEX_MASK)
-    a0 = load_constant_node(states, at_a)
-    a1 = load_constant_node(states, at_a + wp.where(x < 0, 1, 0))
-    b0 = load_constant_node(states, at_b)
-    b1 = load_constant_node(states, at_b + wp.where(y < 0, 1, 0))
+    pairs = load_node_pairs(states, pose, item, live)
+    a0, a1, b0, b1 = pairs.a0, pairs.a1, pairs.b0, pairs.b1
     time = wp.float64(t)
     p = wp.identity(n=3, dtype=wp.float64) + time * motion.way_a
     q = motion.first + time * motion.way_b
@@ -208,14 +204,7 @@ def advance_linear_children(
         image_of(back * motion.way_a, back * motion.way_b, back * speed, motion.scale),
         a0, a1, b0, b1, s, g,
     )  # fmt: skip
-    times = wp.vec4(later(t, s[0]), later(t, s[1]), later(t, s[2]), later(t, s[3]))
-    scale = wp.float32(motion.scale)
-    i00, k00 = go_on(live, a0, b0, scale, g[0], t, times[0], best)
-    i01, k01 = go_on(y & live, a0, b1, scale, g[1], t, times[1], best)
-    i10, k10 = go_on(x & live, a1, b0, scale, g[2], t, times[2], best)
-    i11, k11 = go_on(x & y & live, a1, b1, scale, g[3], t, times[3], best)
-    tests = -((live >> 31) + ((y & live) >> 31) + ((x & live) >> 31) + ((x & y & live) >> 31))
-    return four_items(i00, i01, i10, i11), wp.vec4i(k00, k01, k10, k11), times, tests
+    return emit_later(pairs, wp.float32(motion.scale), g, t, s, best)
 
 
 @wp.func

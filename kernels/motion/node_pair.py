@@ -15,18 +15,19 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import StatePool
 from warp_abtree.kernels.base.boxes import PosedBox, pose_box
-from warp_abtree.kernels.base.nodes import Node, load_constant_node
+from warp_abtree.kernels.base.nodes import Node
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.motion.path import Moment, Motion
 from warp_abtree.kernels.search.item import (
     DROPPED,
     FACES,
-    INDEX_MASK,
     NODES,
+    Emitted,
+    NodePairs,
+    count_used,
     four_items,
-    item_first,
     item_of,
-    item_second,
+    load_node_pairs,
     pack_item,
 )
 
@@ -151,6 +152,23 @@ def go_on(
 
 
 @wp.func
+def emit_later(pairs: NodePairs, scale: wp.float32, gaps: wp.vec4, t: wp.float32, steps: wp.vec4, best: wp.float64):
+    """Return what the pairs of nodes emit that stay apart for steps from t on; times after `best` are dropped."""
+    a0, a1, b0, b1, used = pairs.a0, pairs.a1, pairs.b0, pairs.b1, pairs.used
+    times = wp.vec4(later(t, steps[0]), later(t, steps[1]), later(t, steps[2]), later(t, steps[3]))
+    i00, k00 = go_on(used[0], a0, b0, scale, gaps[0], t, times[0], best)
+    i01, k01 = go_on(used[1], a0, b1, scale, gaps[1], t, times[1], best)
+    i10, k10 = go_on(used[2], a1, b0, scale, gaps[2], t, times[2], best)
+    i11, k11 = go_on(used[3], a1, b1, scale, gaps[3], t, times[3], best)
+    emitted = Emitted()
+    emitted.items = four_items(i00, i01, i10, i11)
+    emitted.kinds = wp.vec4i(k00, k01, k10, k11)
+    emitted.bounds = times
+    emitted.tests = count_used(used)
+    return emitted
+
+
+@wp.func
 def advance_children(
     states: StatePool,
     pose: PairPose,
@@ -161,30 +179,14 @@ def advance_children(
     item: wp.int64,
     live: wp.int32,
 ):
-    """Expand an item from time t on; return the items that follow, their kinds and times, and how many were compared.
-
-    live is -1, or 0 where nothing is asked of the item, which still names nodes. Times after `best` are dropped.
-    """
-    x = item_first(item)
-    y = item_second(item)
-    at_a = pose.node_a + (x & INDEX_MASK)
-    at_b = pose.node_b + (y & INDEX_MASK)
-    a0 = load_constant_node(states, at_a)
-    a1 = load_constant_node(states, at_a + wp.where(x < 0, 1, 0))
-    b0 = load_constant_node(states, at_b)
-    b1 = load_constant_node(states, at_b + wp.where(y < 0, 1, 0))
+    """Expand an item from time t on, as `load_node_pairs` and `emit_later`."""
+    pairs = load_node_pairs(states, pose, item, live)
     home, spin = wp.transpose(boxes.rotation), wp.transpose(boxes.spin)
-    box_a0 = move_box(a0, motion, home, boxes.back, spin, boxes.back_speed)
-    box_a1 = move_box(a1, motion, home, boxes.back, spin, boxes.back_speed)
-    box_b0 = move_box(b0, motion, boxes.rotation, boxes.shift, boxes.spin, boxes.speed)
-    box_b1 = move_box(b1, motion, boxes.rotation, boxes.shift, boxes.spin, boxes.speed)
+    box_a0 = move_box(pairs.a0, motion, home, boxes.back, spin, boxes.back_speed)
+    box_a1 = move_box(pairs.a1, motion, home, boxes.back, spin, boxes.back_speed)
+    box_b0 = move_box(pairs.b0, motion, boxes.rotation, boxes.shift, boxes.spin, boxes.speed)
+    box_b1 = move_box(pairs.b1, motion, boxes.rotation, boxes.shift, boxes.spin, boxes.speed)
     s00, s01 = step_boxes(box_a0, box_b0, motion), step_boxes(box_a0, box_b1, motion)
     s10, s11 = step_boxes(box_a1, box_b0, motion), step_boxes(box_a1, box_b1, motion)
-    times = wp.vec4(later(t, s00[0]), later(t, s01[0]), later(t, s10[0]), later(t, s11[0]))
-    scale = wp.float32(motion.scale)
-    i00, k00 = go_on(live, a0, b0, scale, s00[1], t, times[0], best)
-    i01, k01 = go_on(y & live, a0, b1, scale, s01[1], t, times[1], best)
-    i10, k10 = go_on(x & live, a1, b0, scale, s10[1], t, times[2], best)
-    i11, k11 = go_on(x & y & live, a1, b1, scale, s11[1], t, times[3], best)
-    tests = -((live >> 31) + ((y & live) >> 31) + ((x & live) >> 31) + ((x & y & live) >> 31))
-    return four_items(i00, i01, i10, i11), wp.vec4i(k00, k01, k10, k11), times, tests
+    steps, gaps = wp.vec4(s00[0], s01[0], s10[0], s11[0]), wp.vec4(s00[1], s01[1], s10[1], s11[1])
+    return emit_later(pairs, wp.float32(motion.scale), gaps, t, steps, best)

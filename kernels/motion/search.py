@@ -6,26 +6,31 @@ thread of the CPU takes one object pair after the other; warps search as in `gro
 """
 
 from functools import cache
-from typing import Any
 
 import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.generation import STALE
-from warp_abtree.kernels.base.poses import PairBatch, PairPose
-from warp_abtree.kernels.intersect.face_pairs import Hits, PairTests
+from warp_abtree.kernels.base.poses import PairBatch
+from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, TO_THE_END, TOUCHES, FirstContact, PairProgress
+from warp_abtree.kernels.motion.group import motion_given
 from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
 from warp_abtree.kernels.motion.linear import EndPoses
 from warp_abtree.kernels.motion.start import OPEN, FirstContacts
-from warp_abtree.kernels.search.item import first_item, item_first, item_second
+from warp_abtree.kernels.search.best_first import BestFirstPolicy, Entry, SearchLists, best_first, start_lists
+from warp_abtree.kernels.search.item import Emitted, first_item, item_first, item_second
 from warp_abtree.kernels.search.load_balance import take_thread, take_unit
-from warp_abtree.kernels.search.nearest_stack import push_nearest, read_bound, write_bound
-from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, STRADDLING_START, read_item, write_item
+from warp_abtree.kernels.search.nearest_stack import NEAREST_MEMORY, write_bounded
+from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, STRADDLING_START
 
 MODULE_OPTIONS = native.options(
-    "exact/apart_until.cuh", "exact/determinant.cuh", "search/load_balance.cuh", "search/nearest_stack.cuh"
+    "base/lanes.cuh",
+    "exact/apart_until.cuh",
+    "exact/determinant.cuh",
+    "search/load_balance.cuh",
+    "search/nearest_stack.cuh",
 )
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -38,70 +43,56 @@ def thread_lists(memory: wp.array2d(dtype=wp.int64), thread: wp.int32) -> wp.uin
     """Return the address of a CPU thread's lists."""
 
 
-@wp.func
-def advance_face_pair(
-    items: wp.uint64,
-    i: wp.int32,
-    tolerance: wp.float64,
-    trees: Trees,
-    poses: EndPoses,
-    pose: PairPose,
-    motion: Any,
-    before: FirstContact,
-):
-    """Advance the i-th face pair; return the earliest contact so far, and how many pairs were compared."""
-    best = before
-    progress = PairProgress()
-    progress.time = wp.float64(read_bound(items, STACK_LENGTH + i))
-    progress.mode = TO_THE_END
-    if progress.time > best.time:
-        return best, 0
-    item = read_item(items, STACK_LENGTH + i)
-    faces = wp.vec2i(item_first(item), item_second(item))
-    own, _ = advance_faces(tolerance, trees, poses, pose, motion, faces, progress, best.time)
-    if own.end != CLEAR and (own.time < best.time or (own.time == best.time and best.end != TOUCHES)):
-        # A pair that is undecided at the same time does not matter.
-        best = own
-    return best, 1
+@wp.struct
+class ContactSearch:
+    """Search of a thread for the first contact of an object pair."""
+
+    pair: wp.int32  # its number
+    best: FirstContact  # so far
+    nodes: wp.int32  # pairs of boxes compared
+    faces: wp.int32  # pairs of faces advanced
 
 
-@wp.func
-def search_contact(
-    items: wp.uint64,
-    tolerance: wp.float64,
-    trees: Trees,
-    poses: EndPoses,
-    pose: PairPose,
-    motions: Any,
-    p: wp.int32,
-    start: wp.float64,
-):
-    """Return the first contact of an object pair that is apart until a start, and how many pairs were compared."""
-    best = FirstContact()
-    best.time = wp.float64(1.0)
-    best.end = CLEAR
-    write_item(items, 0, first_item(trees.states, pose))
-    write_bound(items, 0, wp.float32(start))
-    end, waiting = wp.int32(1), wp.int32(0)
-    tests = PairTests()
-    while end > 0 or waiting > 0:
-        if waiting > 0:
-            waiting -= 1
-            best, advanced = advance_face_pair(items, waiting, tolerance, trees, poses, pose, motions[p], best)
-            tests.faces += advanced
-        else:
-            end -= 1
-            item, t = read_item(items, end), read_bound(items, end)
-            if wp.float64(t) <= best.time:
-                children, kinds, times, compared = advance_nodes(trees.states, pose, motions[p], t, best.time, item, -1)
-                push_nearest(items, end, waiting, kinds, children, times)
-                tests.nodes += compared
-    return best, tests
+@cache
+def contact_policy(kind) -> BestFirstPolicy:
+    """Return the policy of threads for motions of a kind: face pairs are advanced to their end, one after the other."""
+    given_type = motion_given(kind)
+
+    @wp.func
+    def expand(trees: Trees, given: given_type, search: wp.ref[ContactSearch], entry: Entry):
+        p, t, best = search.pair, entry.bound, search.best.time
+        emitted = Emitted()
+        if wp.float64(t) <= best:
+            emitted = advance_nodes(trees.states, given.batch.poses[p], given.motion[p], t, best, entry.item, -1)
+            search.nodes += emitted.tests
+        return emitted
+
+    @wp.func
+    def advance(
+        trees: Trees, given: given_type, search: wp.ref[ContactSearch], lists: wp.ref[SearchLists], entry: Entry
+    ):
+        p, best = search.pair, search.best
+        progress = PairProgress()
+        progress.time = wp.float64(entry.bound)
+        progress.mode = TO_THE_END
+        if progress.time <= best.time:
+            faces = wp.vec2i(item_first(entry.item), item_second(entry.item))
+            own, _ = advance_faces(
+                given.tolerance, trees, given.poses, given.batch.poses[p], given.motion[p], faces, progress, best.time
+            )
+            if own.end != CLEAR and (own.time < best.time or (own.time == best.time and best.end != TOUCHES)):
+                # A pair that is undecided at the same time does not matter.
+                search.best = own
+            search.faces += 1
+
+    return BestFirstPolicy(NEAREST_MEMORY, given_type, ContactSearch, None, expand, advance, advance, turns=True)
 
 
 @cache
 def thread_motion_search(kind):
     """Return the kernel of the CPU's threads for motions of a kind."""
+    policy = contact_policy(kind)
+    search_pair, given_type = best_first(policy), policy.given
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def search_thread_kernel(
@@ -121,16 +112,27 @@ def thread_motion_search(kind):
         thread = take_thread(contacts_inout.counter)
         if thread >= memory_out.shape[0]:
             return
-        items = thread_lists(memory_out, thread)
+        given = given_type()
+        given.tolerance = tolerance
+        given.batch = batch
+        given.poses = poses
+        given.motion = motion
+        lists = start_lists(thread_lists(memory_out, thread), STACK_LENGTH)
         p = take_unit(contacts_inout.counter)
         while p < count:
             if contacts_inout.end[p] == OPEN:
-                pose, start = batch.poses[p], contacts_inout.time[p]
-                contact, tests = search_contact(items, tolerance, trees, poses, pose, motion, p, start)
-                contacts_inout.time[p] = contact.time
-                contacts_inout.end[p] = contact.end
-                hits_inout.node_tests[p] += wp.int64(tests.nodes)
-                hits_inout.triangle_tests[p] += wp.int64(tests.faces)
+                search = ContactSearch()
+                search.pair = p
+                search.best.time = wp.float64(1.0)
+                write_bounded(
+                    lists.items, 0, first_item(trees.states, batch.poses[p]), wp.float32(contacts_inout.time[p]), 0
+                )
+                lists.end = 1
+                search_pair(trees, given, search, lists)
+                contacts_inout.time[p] = search.best.time
+                contacts_inout.end[p] = search.best.end
+                hits_inout.node_tests[p] += wp.int64(search.nodes)
+                hits_inout.triangle_tests[p] += wp.int64(search.faces)
             p = take_unit(contacts_inout.counter)
 
     return search_thread_kernel

@@ -58,13 +58,13 @@ def advance_roots(states: StatePool, pose: PairPose, motion: Any):
     item = first_item(states, pose)
     tests = wp.int32(0)
     while tests < ROOT_STEPS:
-        items, kinds, times, _ = advance_nodes(states, pose, motion, t, wp.float64(1.0), item, -1)
+        emitted = advance_nodes(states, pose, motion, t, wp.float64(1.0), item, -1)
         tests += 1
-        if kinds[0] == DROPPED:
+        if emitted.kinds[0] == DROPPED:
             return t, True, tests
-        if items[0] != item:
+        if emitted.items[0] != item:
             return t, False, tests
-        t = times[0]
+        t = emitted.bounds[0]
     return t, False, tests
 
 

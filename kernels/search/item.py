@@ -167,3 +167,55 @@ def item_of(a: Node, b: Node):
     x = wp.where(leaves, a.face, wp.where(span_a + span_a <= span_b, children_of(a.skip), a.skip))
     y = wp.where(leaves, b.face, wp.where(span_b + span_b <= span_a, children_of(b.skip), b.skip))
     return pack_item(x, y)
+
+
+@wp.struct
+class NodePairs:
+    """The one or two nodes of A and of B that an item names; a node that is named alone is its own sibling."""
+
+    at: wp.vec4i  # where they lie in the pool
+    a0: Node  # of A
+    a1: Node  # its sibling
+    b0: Node  # of B
+    b1: Node  # its sibling
+    used: wp.vec4i  # negative for pairs that the item asks for, of a0 and then of a1 with b0 and b1
+
+
+@wp.func
+def load_node_pairs(states: StatePool, pose: PairPose, item: wp.int64, live: wp.int32):
+    """Return the nodes of an item; live is -1, or 0 where nothing is asked of it: it still names nodes.
+
+    `compare_node_pair` has the same in its lines: as a struct it spills registers there.
+    """
+    x, y = item_first(item), item_second(item)
+    at_a, at_b = pose.node_a + (x & INDEX_MASK), pose.node_b + (y & INDEX_MASK)
+    pairs = NodePairs()
+    pairs.at = wp.vec4i(at_a, at_a + wp.where(x < 0, 1, 0), at_b, at_b + wp.where(y < 0, 1, 0))
+    pairs.a0 = load_constant_node(states, pairs.at[0])
+    pairs.a1 = load_constant_node(states, pairs.at[1])
+    pairs.b0 = load_constant_node(states, pairs.at[2])
+    pairs.b1 = load_constant_node(states, pairs.at[3])
+    pairs.used = wp.vec4i(live, y & live, x & live, x & y & live)
+    return pairs
+
+
+@wp.struct
+class Emitted:
+    """Items that follow one: of up to four pairs of nodes."""
+
+    items: four_items  # pairs of nodes, or of faces
+    kinds: wp.vec4i  # DROPPED, NODES or FACES
+    bounds: wp.vec4  # see `best_first`
+    tests: wp.int32  # pairs that were compared
+
+
+@wp.func
+def kind_of(used: wp.int32, a: Node, b: Node, goes_on: bool):
+    """Return what two nodes emit, DROPPED unless they go on."""
+    kind = wp.where((a.face | b.face) >= 0, FACES, NODES)
+    return wp.where(used < 0 and goes_on, kind, DROPPED)
+
+
+@wp.func
+def count_used(used: wp.vec4i):
+    return -((used[0] >> 31) + (used[1] >> 31) + (used[2] >> 31) + (used[3] >> 31))

@@ -113,6 +113,15 @@ def fill_slot(flag: wp.array(dtype=wp.int32), ticket: wp.int32):
 
 
 @wp.func
+def count_to_pop(free: wp.int32, shift: wp.int32, size: wp.int32):
+    """Return how many items to take from a stack of a size with so much room beside what depth first needs.
+
+    One at a time, depth first, needs little room; more where there is.
+    """
+    return wp.min(wp.max(1, free >> shift), wp.min(warp_size(), size))
+
+
+@wp.func
 def note_descent(work: Work):
     """Note that an object pair is not for `small_trees`; the warp that ends the last unit forgets it."""
     work.counter[4] = 1

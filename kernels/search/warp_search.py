@@ -23,6 +23,7 @@ from warp_abtree.kernels.search.load_balance import (
     await_items,
     claim_ahead,
     count_idle,
+    count_to_pop,
     donate_items,
     first_ended,
     first_unit,
@@ -163,11 +164,11 @@ def descend_warp(own: wp.ref[WarpLists], pace: Pace, ready: wp.int32, floor: wp.
     ready_slab = wp.int32(ready)
     visits, node_tests = wp.int32(0), wp.int32(0)
     while visits < pace.tests_max and own.end > own.head and own.slab_pairs < ready_slab and own.leaf_pairs < ready:
-        # One at a time, depth first, needs little room; more where there is. Slab pairs come back to the stack.
+        # Slab pairs come back to the stack.
         size = own.end - own.head
         room = wp.min(pace.stack_room - DEPTH_FIRST_ROOM - size, SLAB_PAIR_LENGTH) - own.slab_pairs
         ready_slab = wp.min(ready, wp.max(1, room - 3))
-        popped = wp.min(wp.max(1, room >> 2), wp.min(warp_size(), size))
+        popped = count_to_pop(room, 2, size)
         node_tests += expand_items(own, popped, floor, trees.states, pose)
         visits += 1
     if own.slab_pairs >= ready_slab or (own.end == own.head and own.slab_pairs > 0):

@@ -16,10 +16,10 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.poses import COORDINATE_MIN
 from warp_abtree.kernels.contacts.contact import SHORTEST_NORMAL
 from warp_abtree.kernels.contacts.separation import CLOSEST, LEAST_SEPARATION
+from warp_abtree.kernels.distance import within
 from warp_abtree.kernels.exact.double_word import BOUND_DOUBLE
 from warp_abtree.kernels.exact.predicates import BOUND_2D, BOUND_3D, EXACT, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.intersect import dual_tree, simd, uncertain_pairs
-from warp_abtree.kernels.intersect.face_pairs import WITHIN
 from warp_abtree.kernels.motion.linear import LinearMotion
 from warp_abtree.kernels.motion.path import Motion
 from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR
@@ -43,9 +43,8 @@ def test_modules_with_signs_do_not_contract():
     names = [info.name for info in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}.") if not info.ispkg]
     modules = [wp.get_module(importlib.import_module(name).__name__) for name in names if not OTHERS.search(name)]
     makers = [functools.partial(dual_tree.warp_traversal, for_any=for_any) for for_any in (False, True)]
-    modules += [
-        make(int(mode)).module for mode in (EXACT, FLOAT32, WITHIN) for make in (simd.thread_traversal, *makers)
-    ]
+    modules += [make(int(mode)).module for mode in (EXACT, FLOAT32) for make in (simd.thread_traversal, *makers)]
+    modules += [make(within.PROVED_APART).module for make in (within.thread_within, within.warp_within)]
     modules += [getattr(uncertain_pairs, f"{name}_kernel").module for name in PASSES]
     assert [m.name for m in modules if m.options["fuse_fp"] or m.options["fast_math"]] == []
 
@@ -145,6 +144,10 @@ def reached(adjoint, found):
 MAKERS = {
     "contacts.near_search": [lambda made: made.thread_near_search()],
     "contacts.points": [lambda made: made.point_chooser(4)],
+    "distance.within": [
+        lambda made: made.thread_within(made.PROVED_APART),
+        lambda made: made.warp_within(made.PROVED_APART),
+    ],
     "intersect.dual_tree": [lambda made: made.warp_traversal(int(EXACT), False)],
     "intersect.relative_pose": [lambda made: made.relative_poses(False)],
     "intersect.simd": [lambda made: made.thread_traversal(int(EXACT))],

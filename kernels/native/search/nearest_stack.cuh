@@ -26,10 +26,9 @@ inline CUDA_CALLABLE void write_bound(wp::uint64 items, wp::int32 i, wp::float32
     *entry<volatile float>(items, 2 * NEAREST_LENGTH + i) = bound;
 }
 
-inline CUDA_CALLABLE void push_nearest(wp::uint64 items, wp::int32& end, wp::int32& leaf_end,
-                                       wp::vec_t<4, wp::int32> kinds, wp::vec_t<4, wp::int64> children,
-                                       wp::vec_t<4, wp::float32> bounds) {
-    // The nearest of each lane comes last, so that it is taken first.
+inline CUDA_CALLABLE void put_nearest_last(wp::vec_t<4, wp::int32>& kinds, wp::vec_t<4, wp::int64>& children,
+                                           wp::vec_t<4, wp::float32>& bounds) {
+    // The nearest comes last, so that it is taken first.
     int order[5][2] = {{0, 1}, {2, 3}, {0, 2}, {1, 3}, {1, 2}};
 #pragma unroll
     for (int n = 0; n < 5; ++n) {
@@ -44,28 +43,6 @@ inline CUDA_CALLABLE void push_nearest(wp::uint64 items, wp::int32& end, wp::int
         children[j] = turn ? child : children[j];
         kinds[i] = turn ? kinds[j] : kind;
         kinds[j] = turn ? kind : kinds[j];
-    }
-#pragma unroll
-    for (int k = 0; k < 4; ++k) {
-#if defined(__CUDA_ARCH__)
-        const unsigned int below = (1u << threadIdx.x) - 1u;
-        const unsigned int nodes = __ballot_sync(0xffffffffu, kinds[k] == 1);
-        const unsigned int faces = __ballot_sync(0xffffffffu, kinds[k] == 2);
-        const int place = (end + __popc(nodes & below)) & (STACK_LENGTH - 1);
-        const int at = kinds[k] == 1 ? place : STACK_LENGTH + leaf_end + __popc(faces & below);
-        if (kinds[k] != 0) {
-            *entry<volatile long long>(items, at) = children[k];
-            *entry<volatile float>(items, 2 * NEAREST_LENGTH + at) = bounds[k];
-        }
-        end += __popc(nodes);
-        leaf_end += __popc(faces);
-#else
-        if (kinds[k] != 0) {
-            const int at = kinds[k] == 1 ? end++ & (STACK_LENGTH - 1) : STACK_LENGTH + leaf_end++;
-            ((long long*)items)[at] = children[k];
-            ((float*)((long long*)items + NEAREST_LENGTH))[at] = bounds[k];
-        }
-#endif
     }
 }
 

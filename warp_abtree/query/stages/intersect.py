@@ -6,13 +6,14 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels.distance.within import PROVED_APART, Question
 from warp_abtree.kernels.intersect import face_pairs, near_faces
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.request import APART_FOR_UNCERTAIN, OUTPUTS, PRECISIONS, check_gap, check_request
 from warp_abtree.query.result import COUNTERS, Found
 from warp_abtree.query.stage import Array, PairDistance, Rooms, Stage
 from warp_abtree.query.stages.inside import InsideStage
-from warp_abtree.query.stages.traversal import Traversal, traversal_kernels
+from warp_abtree.query.stages.traversal import AskedHits, AskedVisits, Traversal, traversal_kernels
 
 
 class HitStage(Stage):
@@ -40,9 +41,11 @@ class HitStage(Stage):
         return [Array(self.hits, "any_hit", wp.int32, rooms.pairs, 0), counts]
 
     def link(self):
-        """Make rows of the counters anew."""
+        """Make rows of the counters anew, and give them to the operator whose hits they count."""
         for k, name in enumerate(("count", *COUNTERS)):
             setattr(self.hits, name, self.counts[k])
+        if self.operator.hits is self.hits:
+            self.operator.counts = self.counts
 
 
 class IntersectStage(HitStage):
@@ -66,23 +69,22 @@ class IntersectStage(HitStage):
         super().__init__()
         self._slots = slots if with_gap else None
         self._is_exact, self._with_gap, self._reads = precision == "exact", with_gap, reads and output == "faces"
-        self._mode = int(face_pairs.GAP if with_gap else PRECISIONS[precision])
-        self._output, self._resting = int(OUTPUTS[output]), resting
+        mode = int(face_pairs.GAP if with_gap else PRECISIONS[precision])
+        self._asked, self._resting = AskedHits(mode, int(OUTPUTS[output]), self._slots is not None), resting
 
     def attach(self, operator: Operator):
         """Take the operator, and give it the hits."""
         super().attach(operator)
         if self._with_gap:
             self.hits.apart_total = wp.zeros(1, dtype=wp.int32, device=operator.device)
-        self.traversal = Traversal(self.operator, self._output == int(face_pairs.OUTPUT_ANY))
+        self.traversal = Traversal(self.operator, self._asked.output == int(face_pairs.OUTPUT_ANY))
         self._no_distance = wp.empty(0, dtype=wp.float64, device=operator.device)
         operator.hits, operator.traversal, operator.lists_hits = self.hits, self.traversal, self._reads
         operator.lists_apart = self._slots is not None
 
     def kernels(self, device) -> list:
         """Return the kernels of the traversal."""
-        is_any = self._output == int(face_pairs.OUTPUT_ANY)
-        return traversal_kernels(device, current_regime(), self._mode, is_any, self._slots is not None)
+        return traversal_kernels(device, current_regime(), self._asked)
 
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return the arrays of hits, and the lists of face pairs that wait."""
@@ -95,11 +97,6 @@ class IntersectStage(HitStage):
         made = [Array(self.hits, name, wp.vec3i, room) for name, room in lists.items()]
         return [*super().arrays(rooms), *self.traversal.arrays(rooms), *made]
 
-    def link(self):
-        """Give the operator the counters."""
-        super().link()
-        self.operator.counts = self.counts
-
     def search(self):
         """Traverse the pairs in place. Launches only."""
         within = self.hits.gap if self._with_gap else self._no_distance
@@ -109,7 +106,7 @@ class IntersectStage(HitStage):
         if self._slots is not None:
             self._slots.start()
             slots = self._slots.slots
-        self.traversal.launch("pairs", within, self.hits, self._mode, self._output, slots)
+        self.traversal.launch("pairs", self._asked, within, self.hits, slots)
 
     def read(self, found: Found, device: bool, with_rows: bool):
         """Read the hits as rows."""
@@ -117,28 +114,28 @@ class IntersectStage(HitStage):
             self.operator.readout.read_hits(found, device)
 
 
-class ApartStage(HitStage):
-    """Find the pairs that are not proved farther apart than a distance.
+class VisitStage(HitStage):
+    """Visit the face pairs of each pair that are not proved farther apart than a distance.
+
+    Args:
+        within: Distances [world units], see `PairDistance`.
+        question: What visits ask.
+        own: What they are given.
 
     Attributes:
-        hits: any_hit is 0 where a pair is proved apart.
         within: The distances, device float64 (pair,).
     """
 
     within: wp.array
 
-    def __init__(self, within):
+    def __init__(self, within, question: Question, own):
         super().__init__()
         self.distance = PairDistance("within", within, proxy(self), "within")
-
-    def attach(self, operator: Operator):
-        """Take the operator, and give it the proofs."""
-        super().attach(operator)
-        operator.near = self.hits
+        self.question, self._asked, self._own = question, AskedVisits(question), own
 
     def kernels(self, device) -> list:
         """Return the kernels of the traversal."""
-        return traversal_kernels(device, current_regime(), int(face_pairs.WITHIN), True)
+        return traversal_kernels(device, current_regime(), self._asked)
 
     def boxes(self, boxes):
         """Return boxes that are wider by half of the distance."""
@@ -146,13 +143,28 @@ class ApartStage(HitStage):
         return boxes
 
     def arrays(self, rooms: Rooms) -> list[Array]:
-        """Return the arrays of proofs."""
+        """Return the distances, and the arrays of hits."""
         return [*super().arrays(rooms), Array(self, "within", wp.float64, rooms.pairs)]
 
     def search(self):
-        """Find what is not proved apart. Launches only."""
-        traversal = self.operator.traversal
-        traversal.launch("within", self.within, self.hits, int(face_pairs.WITHIN), int(face_pairs.OUTPUT_ANY))
+        """Visit them. Launches only."""
+        self.operator.traversal.launch("within", self._asked, self.within, self.hits, self._own)
+
+
+class ApartStage(VisitStage):
+    """Find the pairs that are not proved farther apart than a distance.
+
+    Attributes:
+        hits: any_hit is 0 where a pair is proved apart.
+    """
+
+    def __init__(self, within):
+        super().__init__(within, PROVED_APART, 0)
+
+    def attach(self, operator: Operator):
+        """Take the operator, and give it the proofs."""
+        super().attach(operator)
+        operator.near = self.hits
 
 
 class GapStage(Stage):

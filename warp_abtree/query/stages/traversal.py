@@ -9,6 +9,7 @@ import warp as wp
 from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.contacts import near_search
+from warp_abtree.kernels.distance import within
 from warp_abtree.kernels.exact.predicates import EXACT
 from warp_abtree.kernels.intersect import (
     dual_tree,
@@ -30,64 +31,92 @@ FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
 WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 
 
-def find_passes(mode: int, reduced: bool = False) -> list:
-    """Return the passes over the traversal's lists: kernels, their warps a multiprocessor, threads of a block."""
-    if mode not in (int(EXACT), int(face_pairs.GAP)):
-        return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS)]
-    lists_near = mode == int(face_pairs.GAP) and not reduced
-    return [
-        (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS),
-        (uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS),
-        *([(near_faces.find_near_kernel, EXACT_WARPS_A_PROCESSOR, WARP_SIZE)] if lists_near else []),
-    ]
+class AskedHits(NamedTuple):
+    """Traversal for face pairs that intersect, or are nearer than a gap.
+
+    Attributes:
+        mode, output: As for the kernels, `face_pairs` has them.
+        reduced: Whether what is apart is reduced to slots: threads offer it to them, warps list it.
+    """
+
+    mode: int
+    output: int
+    reduced: bool = False
+
+    def kernel(self, warps: bool):
+        """Return the kernel that traverses."""
+        if warps:
+            return dual_tree.warp_traversal(self.mode, self.output == int(face_pairs.OUTPUT_ANY))
+        return near_search.thread_near_search() if self.reduced else simd.thread_traversal(self.mode)
+
+    def found(self, warps: bool, hits, slots):
+        """Return what it writes."""
+        if warps or not self.reduced:
+            return hits
+        found = near_search.NearFound()
+        found.hits, found.slots = hits, slots
+        return found
+
+    def has_distances(self) -> bool:
+        """Return whether boxes are widened."""
+        return self.mode == int(face_pairs.GAP)
+
+    def passes(self) -> list:
+        """Return the passes over its lists: kernels, their warps a multiprocessor, threads of a block."""
+        if self.mode not in (int(EXACT), int(face_pairs.GAP)):
+            return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS)]
+        lists_near = self.mode == int(face_pairs.GAP) and not self.reduced
+        return [
+            (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS),
+            (uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS),
+            *([(near_faces.find_near_kernel, EXACT_WARPS_A_PROCESSOR, WARP_SIZE)] if lists_near else []),
+        ]
 
 
-def find_search(warps: bool, mode: int, is_any: bool, reduced: bool):
-    """Return the kernel that traverses by warps, or by threads, which may reduce what is apart to slots."""
-    if warps:
-        return dual_tree.warp_traversal(mode, is_any)
-    return near_search.thread_near_search() if reduced else simd.thread_traversal(mode)
+class AskedVisits(NamedTuple):
+    """Traversal that visits face pairs not proved farther apart than a distance."""
+
+    question: within.Question
+
+    @property
+    def output(self) -> int:
+        """What it is called by the kernels."""
+        return self.question.output
+
+    def kernel(self, warps: bool):
+        """Return the kernel that traverses."""
+        return within.warp_within(self.question) if warps else within.thread_within(self.question)
+
+    def found(self, warps: bool, hits, own):
+        """Return what it writes."""
+        found = within.found_struct(self.question.own)()
+        found.hits, found.own = hits, own
+        return found
+
+    def has_distances(self) -> bool:
+        """Return whether boxes are widened."""
+        return True
+
+    def passes(self) -> list:
+        """Return none: each face pair is decided where it is visited."""
+        return []
 
 
-def traversal_kernels(device, regime, mode: int, is_any: bool, reduced: bool = False) -> list:
+def traversal_kernels(device, regime, asked: AskedHits | AskedVisits) -> list:
     """Return the kernels of a traversal with block sizes, those first that take longest to compile."""
     warps = regime.uses_warps(device)
-    searching = find_search(warps, mode, is_any, reduced), WARP_SIZE
+    searching = asked.kernel(warps), WARP_SIZE
     if not warps:
         return [searching]
-    with_distances = mode in (int(face_pairs.WITHIN), int(face_pairs.GAP))
-    passes = [] if mode == int(face_pairs.WITHIN) else reversed(find_passes(mode, reduced))
     return [
         searching,
-        *[(kernel, block) for kernel, _, block in passes],
-        (relative_pose.relative_poses(with_distances), WARP_SIZE),
+        *[(kernel, block) for kernel, _, block in reversed(asked.passes())],
+        (relative_pose.relative_poses(asked.has_distances()), WARP_SIZE),
     ]
 
 
 def _clear_slabs(memory: wp.array):
     memory.numpy()[:, : descent.SLAB_ZEROS] = 0.0
-
-
-class Asked(NamedTuple):
-    """What a traversal is asked for, as `Traversal.launch`."""
-
-    within: wp.array
-    hits: Any
-    mode: int
-    output: int
-    slots: Any
-
-    def kernel(self, warps: bool):
-        """Return the kernel that traverses."""
-        return find_search(warps, self.mode, self.output == int(face_pairs.OUTPUT_ANY), self.slots is not None)
-
-    def found(self, warps: bool):
-        """Return what it writes."""
-        if warps or self.slots is None:
-            return self.hits
-        found = near_search.NearFound()
-        found.hits, found.slots = self.hits, self.slots
-        return found
 
 
 class Traversal:
@@ -151,20 +180,17 @@ class Traversal:
         # Each has memory for slabs: tests do not depend on which thread takes a pair.
         return cores_for(operator.rooms.pairs, least, len(self.slab_memory))
 
-    def launch(self, name: str, within: wp.array, hits, mode: int, output: int, slots=None):
+    def launch(self, name: str, asked: AskedHits | AskedVisits, within: wp.array, hits, beside: Any = None):
         """Launch relative poses, the traversal, and passes over uncertain face pairs.
 
         Args:
             name: Of the recorded launches.
             within: Distances by which boxes are wider [world units], device float64 (pair,); (0,) for none.
             hits: `Hits` to write.
-            mode, output: As for the kernels, `face_pairs` has them.
-            slots: `kernels.contacts.slots.Slots`, started, where what is apart is reduced: threads offer it to them,
-                warps list it. None where it is reported.
+            beside: What it writes beside them: `kernels.contacts.slots.Slots`, started, or what visits are given.
         """
         operator = self.operator
-        asked = Asked(within, hits, mode, output, slots)
-        make = partial(self._make, asked)
+        make = partial(self._make, asked, within, hits, beside)
         if operator.device.is_capturing:
             operator.launch_all(name, make)
             return
@@ -179,48 +205,50 @@ class Traversal:
         for command in passes:
             command.launch()
 
-    def _make(self, asked: Asked, launch) -> list:
+    def _make(self, asked, within: wp.array, hits, beside, launch) -> list:
         """Make the launches of `launch`, see `Commands.find`."""
-        made = self._make_warps if self.operator.uses_warps() else self._make_threads
-        return made(asked, launch) + self._make_passes(asked, launch)
+        warps = self.operator.uses_warps()
+        made = self._make_warps if warps else self._make_threads
+        found = asked.found(warps, hits, beside)
+        return made(asked, within, hits, found, launch) + self._make_passes(asked, hits, launch)
 
-    def _make_warps(self, asked: Asked, launch) -> list:
+    def _make_warps(self, asked, within: wp.array, hits, found, launch) -> list:
         operator, device = self.operator, self.operator.device
         posed = operator.batch.trees, operator.pair_batch
         self.work.warps = self.warp_count()
         # A warp a block: few pairs lie on as many multiprocessors.
         first = launch(
-            relative_pose.relative_poses(len(asked.within) > 0),
+            relative_pose.relative_poses(len(within) > 0),
             dim=max(operator.rooms.pairs, len(self.work.flag)),
-            inputs=[asked.output, posed[0], asked.within, posed[1], asked.hits, self.work],
+            inputs=[asked.output, posed[0], within, posed[1], hits, self.work],
             block_dim=WARP_SIZE,
             device=device,
         )
         traversal = launch(
             asked.kernel(True),
             dim=self.warp_count() * operator.lanes,
-            inputs=[self.stack_length(), asked.output, *posed, asked.found(True), self.work],
+            inputs=[self.stack_length(), asked.output, *posed, found, self.work],
             block_dim=WARP_SIZE,
             device=device,
         )
         return [first, traversal]
 
-    def _make_threads(self, asked: Asked, launch) -> list:
+    def _make_threads(self, asked, within: wp.array, hits, found, launch) -> list:
         """Make the launch in which a thread starts all pairs and traverses them, or one for each of the two."""
         operator, made = self.operator, []
         for starts, traverses in [(True, True)] if self._cores() == 1 else [(True, False), (False, True)]:
             steps = thread_search.ThreadSteps()
-            steps.within, steps.starts, steps.traverses = asked.within, starts, traverses
+            steps.within, steps.starts, steps.traverses = within, starts, traverses
             inputs = [asked.output, operator.batch.trees, operator.regime.plain_tests, steps, operator.pair_batch]
-            inputs += [self.slab_memory, asked.found(False), self.work]
+            inputs += [self.slab_memory, found, self.work]
             made.append(launch(asked.kernel(False), dim=1, inputs=inputs, device=operator.device))
         return made
 
-    def _make_passes(self, asked: Asked, launch) -> list:
-        operator, device, made, hits = self.operator, self.operator.device, [], asked.hits
+    def _make_passes(self, asked, hits, launch) -> list:
+        operator, device, made = self.operator, self.operator.device, []
         if hits.uncertain is None or not len(hits.uncertain):
             return []
-        for kernel, warps, block in find_passes(asked.mode, asked.slots is not None):
+        for kernel, warps, block in asked.passes():
             threads = warps * device.sm_count * WARP_SIZE if device.is_cuda else 1
             output = [] if kernel is near_faces.find_near_kernel else [asked.output]
             inputs = [threads, *output, operator.batch.trees, operator.pair_batch, hits]
