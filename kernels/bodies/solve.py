@@ -237,9 +237,7 @@ def relax_pair(
     for _visit in range(visits):
         for i in range(count):
             k = point_of_turn(i, count, relaxation.backward)
-            impulse = wp.vec3d()
-            moment_a = wp.vec3d()
-            moment_b = wp.vec3d()
+            impulse, moment_a, moment_b = wp.vec3d(), wp.vec3d(), wp.vec3d()
             if warp_size() == 1 or resolve_lane() == k:
                 if warp_size() == 1:
                     point = load_point(rest, p, k, a, b, manifolds, constraints)

@@ -1,7 +1,8 @@
 """Radix sort of numbers on a device, with the errors that Warp's reports nowhere but in its log."""
 
 import ctypes
-from typing import Any
+from functools import cache
+from pathlib import Path
 
 import warp as wp
 
@@ -25,7 +26,8 @@ def radix_sort(keys: wp.array, values: wp.array, count: int, bits: int):
     raise RuntimeError(f"{count} numbers on {keys.device} were not sorted: {error}")
 
 
+@cache
 def _error_address() -> int:
     """Return where Warp's library keeps its last error, a string that no later success clears."""
-    core: Any = wp._src.context.runtime.core
-    return ctypes.CFUNCTYPE(ctypes.c_void_p)(("wp_get_error_string", core))()
+    library = ctypes.CDLL(str(next(Path(wp.__file__).parent.glob("bin/*warp.*"))))
+    return ctypes.CFUNCTYPE(ctypes.c_void_p)(("wp_get_error_string", library))()
