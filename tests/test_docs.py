@@ -315,10 +315,10 @@ def test_planning_example(device, tmp_path):
 def test_worlds_example(device):
     torch = pytest.importorskip("torch")
     words = "--worlds 3 --samples 24 --rounds 6 --device".split()
-    (poses, hit), shown = run_example("worlds_torch", *words, device)
+    (poses, hit), shown = run_example("interop/worlds_torch", *words, device)
     assert "of 3 rings on their pegs" in shown
     assert poses.shape == (3 + 3 * 24, 7) and hit.dtype == torch.bool
-    scene, pairs = runpy.run_path(str(ROOT / "scenes" / "worlds_torch.py"))["make_scene"](3, 24, device)
+    scene, pairs = runpy.run_path(str(ROOT / "scenes" / "interop" / "worlds_torch.py"))["make_scene"](3, 24, device)
     scene.set_poses(poses.cpu().numpy())
     expected = scene.intersect(pairs).any
     assert np.array_equal(hit.cpu().numpy(), expected) and 0 < expected.sum() < len(pairs)
@@ -326,7 +326,7 @@ def test_worlds_example(device):
 
 def test_worlds_example_without_torch(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
-    refused(SystemExit, "skipped: this example needs PyTorch", run_example, "worlds_torch", "--device", "cpu")
+    refused(SystemExit, "skipped: this example needs PyTorch", run_example, "interop/worlds_torch", "--device", "cpu")
 
 
 @pytest.mark.slow

@@ -144,7 +144,7 @@ def test_a_bar_that_jams_in_a_slot_is_pushed_by_each_wall_by_what_it_is_in_it(de
 
 def test_a_nut_is_no_deeper_in_its_thread_than_it_was_moved(device):
     """From where it is free, by shifts and tilts of at most so much; loops run from flank to flank of the thread."""
-    parts = runpy.run_path(str(pathlib.Path(__file__).parents[2] / "scenes/newton_nut_and_bolt.py"))
+    parts = runpy.run_path(str(pathlib.Path(__file__).parents[2] / "scenes/interop/newton_nut_and_bolt.py"))
     pitch, (vertices, faces) = parts["PITCH"], parts["make_nut"](16, 3)
     bolt, wide = ab.Model.from_arrays(*parts["make_bolt"](16, 8)), ab.Model.from_arrays(vertices, faces)
     middle = parts["find_height"](bolt, wide, pitch, 2 * pitch)

@@ -9,7 +9,7 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco_warp", reason="needs mujoco_warp (extra test)")
 
-SCENE = Path(__file__).resolve().parents[2] / "scenes" / "mujoco_warp_contacts.py"
+SCENE = Path(__file__).resolve().parents[2] / "scenes" / "interop" / "mujoco_warp_contacts.py"
 
 
 @pytest.mark.slow

@@ -178,7 +178,7 @@ def test_a_surface_that_moves_is_refused(device):
 
 @pytest.fixture(scope="module")
 def scene():
-    path = pathlib.Path(__file__).parents[2] / "scenes/newton_nut_and_bolt.py"
+    path = pathlib.Path(__file__).parents[2] / "scenes/interop/newton_nut_and_bolt.py"
     spec = importlib.util.spec_from_file_location("newton_nut_and_bolt", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -3,7 +3,7 @@
 MuJoCo takes a mesh by its convex hull, on which a ring stays lying on the peg. Mesh geoms alone have contacts here: a
 floor is a mesh, too. Needs mujoco_warp 4:
 
-    python scenes/mujoco_warp_contacts.py [--device cpu] [--worlds 4] [--seconds 2]
+    python scenes/interop/mujoco_warp_contacts.py [--device cpu] [--worlds 4] [--seconds 2]
 """
 
 import argparse

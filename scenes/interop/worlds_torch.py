@@ -4,7 +4,7 @@ In each world a ring is to come down on its own peg, which stands aslant. PyTorc
 method, `PoseInput` places the rings from the tensors' memory, `Query` tells which collide, and PyTorch reads its answer
 where it lies. Needs PyTorch (pip install torch):
 
-    python scenes/worlds_torch.py [--device cuda:0] [--worlds 64] [--samples 64] [--rounds 20]
+    python scenes/interop/worlds_torch.py [--device cuda:0] [--worlds 64] [--samples 64] [--rounds 20]
 """
 
 import argparse

@@ -3,7 +3,7 @@
 Newton 1.8's own pipeline threads the rings too, by edges against a BVH, or by fields of distances made beforehand on
 CUDA. Needs the extra `newton`:
 
-    python scenes/newton_contacts.py [--device cpu] [--rings 6] [--seconds 3]
+    python scenes/interop/newton_contacts.py [--device cpu] [--rings 6] [--seconds 3]
 """
 
 import argparse
