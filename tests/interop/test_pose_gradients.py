@@ -216,6 +216,6 @@ def test_bad_input_moves_nothing(device):
 def test_bad_tensors(device, torch, pair_distance):
     query, poses = make_query(device)
     refused(TypeError, "torch.Tensor is expected", pair_distance, query, poses)
-    refused(ValueError, "no contiguous", pair_distance, query, torch.tensor(poses).half())
+    refused(ValueError, "no contiguous", pair_distance, query, torch.tensor(poses, device=device).half())
     if query.device.is_cuda:
         refused(ValueError, "the query is on cuda", pair_distance, query, torch.tensor(poses))
