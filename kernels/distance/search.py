@@ -166,7 +166,9 @@ def decide_open(
     The pose in float64 is loaded here, so that the search need not keep it in registers.
     """
     found, pair = given.found, search.pair
-    live = entry.live and entry.bound <= load_upper(found.upper, pair)[UPPER]
+    # All lanes load it together, those without an entry, too.
+    upper = load_upper(found.upper, pair)[UPPER]
+    live = entry.live and entry.bound <= upper
     if warp_any(live):
         d = wp.float64(wp.inf)
         if live:

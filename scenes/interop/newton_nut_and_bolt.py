@@ -4,7 +4,7 @@ Each nut is alone with its bolt in a world. A motor turns it, blows of a hammer 
 jump no thread. Nuts start at angles of their own, and differ in speed and blows. The thread is generated, or read from
 two files. Needs the extra `newton`, and `mujoco-warp` for MuJoCo:
 
-    python scenes/interop/newton_nut_and_bolt.py [--solver xpbd|mujoco] [--nuts 100] [--turns 2] [--hammer 0.5] [--device cpu]
+    python scenes/interop/newton_nut_and_bolt.py [--solver xpbd|mujoco] [--nuts 100] [--turns 2] [--hammer 0.5]
     python scenes/interop/newton_nut_and_bolt.py --bolt bolt.obj --nut nut.obj --pitch 0.0025 --height 0.01
 """
 
