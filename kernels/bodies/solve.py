@@ -11,7 +11,15 @@ Pairs of one color share no dynamic body, so one thread for all of them and a th
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.lanes import block_sync, resolve_lane, vector64_of_lane, warp_max, warp_size, warp_sync
+from warp_abtree.kernels.base.lanes import (
+    block_sync,
+    resolve_lane,
+    vector64_of_lane,
+    warp_any,
+    warp_max,
+    warp_size,
+    warp_sync,
+)
 from warp_abtree.kernels.base.poses import HALF, PairBatch
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, ONE, ZERO, Bodies
 from warp_abtree.kernels.bodies.constraints import Constraints
@@ -33,8 +41,12 @@ RECOVERY = wp.constant(wp.float64(_FREQUENCY / _RESPONSE))
 SOFTNESS = wp.constant(wp.float64(1.0 / (1.0 + _FREQUENCY * _RESPONSE)))
 """Part of the impulse that it gives up."""
 
-VISITS_LEAST, VISITS_MAX = wp.constant(3), wp.constant(64)
-"""How often a pass relaxes the points of a pair before the next pair: once more for each doubling of a hard impact."""
+VISITS_LEAST, VISITS_USUAL, VISITS_MAX = wp.constant(3), wp.constant(5), wp.constant(64)
+"""How often a pass relaxes the points of a pair before the next pair: more than the least while speeds change much, at
+most as usual, and once more for each doubling of a hard impact."""
+
+SETTLED = wp.constant(wp.float64(2.0**-6))
+"""Change of speed that is not much, as a part of `fast`."""
 
 HARD = wp.constant(wp.float64(2.0**-3))
 """Part of the speed of an impact that, if fast, makes it hard."""
@@ -204,6 +216,16 @@ def point_of_turn(i: wp.int32, count: wp.int32, backward: wp.int32):
 
 
 @wp.func
+def most_visits(fast: wp.float64, speed: wp.float64):
+    """Return how often the points of a pair that meet at a speed are relaxed at most."""
+    visits, left = wp.int32(VISITS_USUAL), HARD * speed
+    while left > fast and visits < VISITS_MAX:
+        visits += 1
+        left *= HALF
+    return visits
+
+
+@wp.func
 def relax_pair(
     relaxation: Relaxation, p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constraints: Constraints, bodies: Bodies
 ):
@@ -215,10 +237,8 @@ def relax_pair(
     """
     stage, count, slop = relaxation.stage, manifolds.count[p], constraints.slop[p]
     rest = relaxation.rest * slop
-    a = load_side(bodies, pair[0])
-    b = load_side(bodies, pair[1])
-    motion_a = load_motion(bodies, pair[0])
-    motion_b = load_motion(bodies, pair[1])
+    a, b = load_side(bodies, pair[0]), load_side(bodies, pair[1])
+    motion_a, motion_b = load_motion(bodies, pair[0]), load_motion(bodies, pair[1])
     # Without gravity two rigid bodies are not pushed apart, which would add energy.
     corrects = stage == SOLVE and (relaxation.fast > ZERO or not (a.is_dynamic and b.is_dynamic))
     point = RelaxedPoint()
@@ -228,13 +248,13 @@ def relax_pair(
         speed = wp.dot(point.normal, relative_velocity(motion_a, motion_b, point.arm_a, point.arm_b))
         fastest = wp.max(fastest, -speed)
     fastest = warp_max(fastest)
+    settled = SETTLED * relaxation.fast
     struck = wp.where(stage == RELAX, constraints.is_struck[p], 0)
     struck = wp.where(fastest > relaxation.fast, 1, struck)
-    visits, rest_speed = wp.int32(VISITS_LEAST), HARD * fastest
-    while rest_speed > relaxation.fast and visits < VISITS_MAX:
-        visits += 1
-        rest_speed *= HALF
-    for _visit in range(visits):
+    visit, visits = wp.int32(0), most_visits(relaxation.fast, fastest)
+    while visit < visits:
+        visit += 1
+        changes = bool(False)
         for i in range(count):
             k = point_of_turn(i, count, relaxation.backward)
             impulse, moment_a, moment_b = wp.vec3d(), wp.vec3d(), wp.vec3d()
@@ -251,6 +271,7 @@ def relax_pair(
                 # What is still to come near has no friction yet.
                 most = wp.where(point.room > slop, ZERO, relaxation.friction * after)
                 wanted = friction_of(a, b, point, most, velocity - wp.dot(n, velocity) * n)
+                changes = changes or wp.abs(more) > settled * point.mass
                 impulse = more * n + (wanted - point.across)
                 moment_a = wp.cross(point.arm_a, impulse)
                 moment_b = wp.cross(point.arm_b, impulse)
@@ -261,6 +282,8 @@ def relax_pair(
             impulse = vector64_of_lane(impulse, k)
             motion_a = push(a, motion_a, -impulse, -vector64_of_lane(moment_a, k))
             motion_b = push(b, motion_b, impulse, vector64_of_lane(moment_b, k))
+        if visit >= VISITS_LEAST and not warp_any(changes):
+            visit = visits
     if resolve_lane() == 0:
         constraints.is_struck[p] = struck
         store_motion(a, motion_a, bodies, pair[0])
