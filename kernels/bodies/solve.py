@@ -232,8 +232,8 @@ def relax_pair(
     """Relax the points of a pair: the normal velocity, then the tangential one within the friction cone.
 
     The points are relaxed several times, one after the other: each by the lane of a warp that holds it, while all lanes
-    hold the motion of both objects. An impulse acts on both at one place: no momentum is lost. A
-    pair is struck if it meets fast where a pass begins.
+    hold the motion of both objects. An impulse acts on both at one place: no momentum is lost. A pair is struck if it
+    meets fast where a pass begins.
     """
     stage, count, slop = relaxation.stage, manifolds.count[p], constraints.slop[p]
     rest = relaxation.rest * slop
