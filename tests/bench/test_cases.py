@@ -86,7 +86,7 @@ def check_host(rows):
     ]
     for row in rows:
         records = {"contacts": 12 + 133, "faces": 12}.get(row["output"], 0) * (row["hits"] or 0)
-        of_pairs = {"any": 33, "contacts": 41 + 64}.get(row["output"], 41)
+        of_pairs = {"any": 33, "contacts": 41 + 56}.get(row["output"], 41)
         assert row["bytes"] == records + of_pairs * row["pairs"] and row["goal_ms"] >= row["launches_ms"] > 0
 
 
