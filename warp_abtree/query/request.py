@@ -32,7 +32,7 @@ class CapacityError(RuntimeError):
 
 
 # Where all face pairs that may be near are listed, those that are uncertain have this part of the room.
-APART_FOR_UNCERTAIN = 4
+APART_FOR_UNCERTAIN = 2
 
 
 @dataclass(frozen=True)
