@@ -104,6 +104,8 @@ def _measure(scene, asked, points, within) -> tuple:
 
 def _check_points(points) -> np.ndarray:
     points = to_numpy(points, "points")
+    if points.shape == (0,):
+        return np.empty((0, 3))
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "iuf":
         raise ValueError(f"points: shape {points.shape} and type {points.dtype}, not numbers of shape (n, 3)")
     points = points.astype(np.float64, order="C")
