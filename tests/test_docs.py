@@ -67,7 +67,7 @@ def run_block(tmp_path_factory):
             if not missing(needs):
                 # Line numbers of the page, for a traceback that can be read.
                 start = page.read_text(encoding="utf-8").split("```python\n")[: i + 1]
-                lines = sum(part.count("\n") + 1 for part in start) - 1
+                lines = sum(part.count("\n") + 1 for part in start)
                 exec(compile("\n" * lines + block, name_of(page), "exec"), space)
 
     folder = tmp_path_factory.mktemp("docs")
