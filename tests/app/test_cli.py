@@ -219,7 +219,10 @@ def test_query_of_a_scene_file(files, capsys, device):
     ("words", "message"),
     [
         ("query ball.obj", "ball.obj: B is missing; alone stands a scene file"),
-        ("query gone.glb", "gone.glb: "),
+        ("query gone.glb", "gone.glb: no such file"),
+        ("query gone.npz", "gone.npz: no such file"),
+        ("query .", ".: is a folder"),
+        ("query torn.glb", "torn.glb: cannot be read"),
         ("query balls.toml --pose 0 0 0 0 0 0 1", "--pose: for two meshes; balls.toml says"),
         ("query balls.toml --lod-b 0.1", "--lod-b: for two meshes; balls.toml says"),
         ("query balls.toml --output distance --signed", "signed: no object"),
@@ -227,6 +230,7 @@ def test_query_of_a_scene_file(files, capsys, device):
 )
 def test_query_of_a_scene_refuses(files, capsys, words, message):
     Path("balls.toml").write_text(TWO_BALLS)
+    Path("torn.glb").write_bytes(b"glTF")
     shown, errors = run(capsys, *words.split(), status=2)
     assert not shown and len(errors) == 1 and message in errors[0]
 

@@ -180,6 +180,7 @@ def test_errors_name_the_path_that_was_asked_for(tmp_path):
         ("missing/x.npz", FileNotFoundError),
         ("file/x.npz", NotADirectoryError),
         ("folder", IsADirectoryError),
+        ("/", IsADirectoryError),
         ("x" * 300, OSError),
     ):
         with pytest.raises(kind) as caught, atomic_write(tmp_path / name):

@@ -184,9 +184,11 @@ def test_scene_of_points_refuses(device):
     refused(ValueError, "no object in world 0", scene.signed_distance, np.zeros((1, 3)))
     scene.add(sample("small ball"), world=3)
     refused(ValueError, "no object in world 0", scene.signed_distance, np.zeros((1, 3)))
-    refused(ValueError, "no object is a solid", scene.signed_distance, np.zeros((1, 3)), world=3)
+    refused(ValueError, "no object of world 3 is a solid", scene.signed_distance, np.zeros((1, 3)), world=3)
     refused(ValueError, "within: -1", scene.signed_distance, np.zeros((1, 3)), 3, False, -1)
+    refused(ValueError, "points: one distance for all", scene.signed_distance, np.zeros((2, 3)), 3, False, [1, 1])
     refused(ValueError, "point 0 is not finite", scene.signed_distance, [[np.inf, 0, 0]], 3, False)
+    assert scene.signed_distance([], 3, False, nearest=True)[2].shape == (0, 3)
     distance, object = scene.signed_distance(np.zeros((0, 3)), 3, False)
     assert distance.shape == object.shape == (0,)
 

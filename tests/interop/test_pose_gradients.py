@@ -211,11 +211,33 @@ def test_bad_input_moves_nothing(device):
     refuse(poses, "a DistanceQuery is expected", TypeError, ab.Query(make_query(device)[0].batch, pairs=PAIRS))
     refuse(poses, "broad phase", asked=ab.DistanceQuery(query.batch))
     assert not tape.launches
+    given = wp.array(poses, **real)
+    refused(TypeError, "tape: a wp.Tape is expected", record_pair_distance, None, query, given)
+
+
+def test_poses_of_a_scene_that_has_grown(device):
+    scene = scene_with(device, *[(sample(name), {}) for name in NAMES])
+    query = ab.DistanceQuery(scene, PAIRS)
+    scene.add(sample("torus"))
+    given = wp.zeros((5, 7), dtype=wp.float64, device=device, requires_grad=True)
+    refused(RuntimeError, "objects were added", record_pair_distance, wp.Tape(), query, given)
+
+
+def test_a_tape_of_no_pairs(device):
+    query, poses = make_query(device, np.empty((0, 2), int))
+    given = wp.array(poses, dtype=wp.float64, device=device, requires_grad=True)
+    loss, tape = wp.zeros(1, dtype=wp.float64, device=device, requires_grad=True), wp.Tape()
+    with tape:
+        distance = record_pair_distance(tape, query, given)
+        wp.launch(weigh_kernel, len(distance), [distance, loss], device=device)
+    tape.backward(loss)
+    assert distance.shape == (0,) and not given.grad.numpy().any()
 
 
 def test_bad_tensors(device, torch, pair_distance):
     query, poses = make_query(device)
     refused(TypeError, "torch.Tensor is expected", pair_distance, query, poses)
+    refused(TypeError, "not a torch.sparse_coo", pair_distance, query, torch.tensor(poses, device=device).to_sparse())
     refused(ValueError, "no contiguous", pair_distance, query, torch.tensor(poses, device=device).half())
     if query.device.is_cuda:
         refused(ValueError, "the query is on cuda", pair_distance, query, torch.tensor(poses))

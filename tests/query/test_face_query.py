@@ -91,3 +91,32 @@ def test_pairs_keep_their_order_and_a_hit_ends_one(sampled, scene_and_meshes):
 
 def test_refuses_bad_distances(scene_and_meshes):
     refused(ValueError, "within", FaceQuery, scene_and_meshes[0], visit_least, LeastDistance(), [(0, 1)], within=-1.0)
+
+
+@wp.func
+def visit_less(pair: wp.int32, faces: wp.vec2i):
+    return True
+
+
+@wp.func
+def visit_other(pair: wp.int32, faces: wp.vec2i, trees: Trees, pose: wp.int32, own: LeastDistance):
+    return True
+
+
+@pytest.mark.parametrize(
+    ("visit", "own", "message"),
+    [
+        (lambda *given: True, LeastDistance(), "visit: a Warp function .* not a function"),
+        (visit_less, LeastDistance(), r"visit_less: takes \(pair, faces\), not \(pair, faces, trees, pose, own\)"),
+        (visit_other, LeastDistance(), "visit_other: pose is a int32, given is a .*PairPose"),
+        (visit_least, Trees(), "visit_least: own is a .*LeastDistance, given is a .*Trees"),
+        (visit_least, LeastDistance, "own: an instance of a Warp struct is expected, not a Struct"),
+        (visit_least, None, "own: an instance of a Warp struct is expected, not a NoneType"),
+    ],
+)
+def test_refuses_what_cannot_be_called(visit, own, message):
+    scene = ab.Scene(device="cpu")
+    for _ in range(2):
+        scene.add(ab.Model.load(trimesh.creation.box()))
+    with pytest.raises(TypeError, match=message):
+        FaceQuery(scene, visit, own, [(0, 1)])

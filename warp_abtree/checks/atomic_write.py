@@ -29,6 +29,8 @@ def atomic_write(path, mode="wb", **options):
     path, file = Path(path), None
     if is_special(path):
         raise OSError(errno.EINVAL, "is neither a file nor a folder", str(path))
+    if not path.name:  # "", "." or "/"
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     try:
         file = _open_partial(path, mode, options)
         with file:

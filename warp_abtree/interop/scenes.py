@@ -154,11 +154,16 @@ def _read_objects(path: Path, remarks):
     return found.as_scene(name) if isinstance(found, FileSurface) else found
 
 
-def is_assembly(path) -> bool:
-    """Return whether a file is a scene of its own: of several objects, or USD, of which `Model.load` reads no mesh."""
+def is_assembly(path, readable=False) -> bool:
+    """Return whether a file is a scene of its own: of several objects, or USD, of which `Model.load` reads no mesh.
+
+    One that cannot be read is none; or MeshError is raised, where it has to be readable.
+    """
     try:
         count = len(_read_objects(Path(path), Remarks()).graph.nodes_geometry)
     except MeshError:
+        if readable:
+            raise
         return False
     return count > (0 if split_file_name(Path(path))[1] in USD else 1)
 

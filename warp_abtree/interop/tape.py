@@ -48,14 +48,10 @@ class PosedDistances:
         gradient: As `Result.gradient`, on the device.
 
     Raises:
-        TypeError: Another query.
-        ValueError: A query that runs the broad phase; or a pose is none, and no object has moved.
-        RuntimeError: A graph is being captured, or as `DistanceQuery.launch`.
+        ValueError: A pose is none, and no object has moved.
     """
 
     def __init__(self, query: DistanceQuery, rows: wp.array):
-        check_device(query.device, "pair_distance (PoseInput and DistanceQuery.launch can)")
-        query.check_scene()
         place_rows(rows, query.batch.objects.pool, ANY_NORM)
         query.grow()
         count, found = len(query.given), query.distances
@@ -73,9 +69,17 @@ class PosedDistances:
 
 
 def check_query(query: Any):
-    """Raise where `PosedDistances` refuses a query."""
+    """Raise where a query cannot give `PosedDistances`.
+
+    Raises:
+        TypeError: No `DistanceQuery`.
+        ValueError: One that runs the broad phase.
+        RuntimeError: A graph is being captured, or as `DistanceQuery.launch`.
+    """
     if not isinstance(query, DistanceQuery):
         raise TypeError(f"query: a DistanceQuery is expected, not a {type(query).__name__}")
+    check_device(query.device, "pair_distance (PoseInput and DistanceQuery.launch can)")
+    query.check_scene()
     if query.given is None:
         raise ValueError("query: its pairs come from the broad phase; make it with pairs, such as scene.broad_phase()")
 
@@ -107,9 +111,11 @@ def record_pair_distance(tape: wp.Tape, query: DistanceQuery, poses: wp.array) -
         within the rigid motions.
 
     Raises:
-        TypeError, ValueError, RuntimeError: As `PosedDistances`; or poses of another shape, count, type or device, or
-            without a gradient. No object has moved.
+        TypeError, ValueError, RuntimeError: As `check_query` and `PosedDistances`; no tape; or poses of another shape,
+            count, type or device, or without a gradient. No object has moved.
     """
+    if not isinstance(tape, wp.Tape):
+        raise TypeError(f"tape: a wp.Tape is expected, not a {type(tape).__name__}")
     check_query(query)
     if not isinstance(poses, wp.array) or poses.grad is None:
         raise ValueError("poses: a Warp array made with requires_grad=True is expected")
@@ -118,5 +124,6 @@ def record_pair_distance(tape: wp.Tape, query: DistanceQuery, poses: wp.array) -
     del tape.launches[recorded:]  # the query's own, where the tape is recording
     distance = posed.distance
     distance.requires_grad = True
-    tape.record_func(lambda: posed.add_gradient(distance.grad, pose_rows(poses.grad, query)), [poses, distance])
+    if len(distance):  # an empty array has no gradient
+        tape.record_func(lambda: posed.add_gradient(distance.grad, pose_rows(poses.grad, query)), [poses, distance])
     return distance

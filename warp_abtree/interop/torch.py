@@ -60,7 +60,7 @@ def pair_distance(query: DistanceQuery, poses):
         points are not unique, or the distance is 0 or infinite, see `query.stages.distance`.
 
     Raises:
-        TypeError: No `DistanceQuery`, or poses that are no tensor.
+        TypeError: No `DistanceQuery`, or poses that are no dense tensor.
         ValueError: A query that runs the broad phase, poses of another shape, count, type or device, or one that is no
             pose; no object has moved.
         RuntimeError: A graph is being captured, or as `DistanceQuery.launch`.
@@ -68,6 +68,7 @@ def pair_distance(query: DistanceQuery, poses):
     import torch
 
     check_query(query)
-    if not isinstance(poses, torch.Tensor):
-        raise TypeError(f"poses: a torch.Tensor is expected, not a {type(poses).__name__}")
+    if not isinstance(poses, torch.Tensor) or poses.layout != torch.strided:
+        kind = getattr(poses, "layout", type(poses).__name__)
+        raise TypeError(f"poses: a dense torch.Tensor is expected, not a {kind}")
     return _make_function().apply(poses, query)

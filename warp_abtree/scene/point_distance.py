@@ -79,14 +79,16 @@ def object_distances(scene: PosedObjects, points, world, signed, within, nearest
         raise ValueError(f"the scene has no object in world {world}")
     solid = np.array(scene.object_solid)[objects] & signed
     if signed and not solid.any():
-        raise ValueError("signed: no object is a solid; give solid=True to Scene.add, or signed=False")
+        raise ValueError(
+            f"signed: no object of world {world} is a solid; give solid=True to Scene.add, or signed=False"
+        )
     found = _measure(scene, np.column_stack([objects, solid]), points, within)
     return found if nearest else found[:2]
 
 
 def _measure(scene, asked, points, within) -> tuple:
     """Return the outputs of points from objects of a scene, rows of (object, whether it has an inside)."""
-    most = np.inf if within is None else float(check_within(within))
+    most = np.inf if within is None else float(check_within(within, known="points: one distance for all"))
     batch, n, device = scene.batch(), len(points), scene.device
     found = kernels.PointDistances()
     for name, dtype in OUTPUTS.items():
@@ -102,6 +104,8 @@ def _measure(scene, asked, points, within) -> tuple:
 
 def _check_points(points) -> np.ndarray:
     points = to_numpy(points, "points")
+    if points.shape == (0,):
+        return np.empty((0, 3))
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "iuf":
         raise ValueError(f"points: shape {points.shape} and type {points.dtype}, not numbers of shape (n, 3)")
     points = points.astype(np.float64, order="C")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.app.cli.arguments import LOD_HELP, MESHES, PRECISION_NAMES, Parser
-from warp_abtree.app.cli.model_commands import diagonal_of, load_model, lod_at
+from warp_abtree.app.cli.model_commands import diagonal_of, is_model, load_model, lod_at
 from warp_abtree.app.cli.report import check_output, print_result, show_number
 from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.scene_file import load_scene
@@ -112,7 +112,8 @@ def _query_scene(options, progress):
         if getattr(options, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')}: for two meshes; {options.a} says where its objects are")
     path = find_scene(options.a)
-    if path.suffix.lower() != ".toml" and not (path.is_file() and is_assembly(path)):
+    is_built = is_model(options.a) and path.is_file()
+    if path.suffix.lower() != ".toml" and (is_built or not is_assembly(path, readable=True)):
         raise ValueError(f"{options.a}: B is missing; alone stands a scene file or a file of several objects")
     scene = load_scene(options.a, device=options.device, progress=progress).scene
     progress.close()

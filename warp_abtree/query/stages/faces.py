@@ -3,7 +3,9 @@
 from typing import Any
 
 import warp as wp
+from warp.types import types_equal
 
+from warp_abtree.checks.arguments import flag
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.distance.within import DISTANCE_HEADERS, Question, face_distance
@@ -29,6 +31,24 @@ class FaceStage(VisitStage):
         return [*super().arrays(rooms), *traversal.arrays(rooms), Array(self.hits, "face", wp.vec3i, 0)]
 
 
+def _check_visit(visit, own):
+    """Return the type of `own`; raise TypeError where a visit cannot be called with it."""
+    given = getattr(own, "_cls", None)
+    if given is None:
+        raise TypeError(f"own: an instance of a Warp struct is expected, not a {type(own).__name__}")
+    if not isinstance(visit, wp.Function):
+        raise TypeError(f"visit: a Warp function (@wp.func) is expected, not a {type(visit).__name__}")
+    asked = visit.input_types
+    if len(asked) != 5:
+        raise TypeError(f"visit {visit.key}: takes ({', '.join(asked)}), not (pair, faces, trees, pose, own)")
+    known = [wp.int32, wp.vec2i, Trees, PairPose, given]
+    for (name, kind), expected in zip(asked.items(), known):
+        if kind is not Any and not types_equal(kind, expected):
+            kinds = (getattr(k, "key", getattr(k, "__name__", k)) for k in (kind, expected))
+            raise TypeError("visit {}: {} is a {}, given is a {}".format(visit.key, name, *kinds))
+    return given
+
+
 class FaceQuery(Operator):
     """Visits of the face pairs that may be near, as an operator: allocates once, launches many times.
 
@@ -46,11 +66,13 @@ class FaceQuery(Operator):
         for_any: Whether one hit is enough: a pair is visited until there is one.
 
     Raises:
+        TypeError: visit is no Warp function of these arguments, or own no Warp struct of its last one's type.
         ValueError: Bad pairs or distances, an empty scene.
         RuntimeError: A graph is being captured.
     """
 
     def __init__(self, scene, visit, own: Any, pairs=None, within=0.0, for_any=False, capacity=None, sort_pairs=False):
-        question = Question(visit, own._cls, for_any, DISTANCE_HEADERS)
+        for_any = flag(for_any, "for_any")
+        question = Question(visit, _check_visit(visit, own), for_any, DISTANCE_HEADERS)
         stage, output = FaceStage(within, question, own), "any" if for_any else "count"
         super().__init__(scene, [stage], pairs, capacity, output, sort_pairs)
