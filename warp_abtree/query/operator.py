@@ -22,15 +22,14 @@ from warp_abtree.kernels.search.make_slabs import make_slab_kernel
 from warp_abtree.query.broad_phase import BroadPhase, PosedBoxes
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.readout import Readout, readout_kernels
-from warp_abtree.query.request import LIST_MAX, check_capacity, check_pair_room
+from warp_abtree.query.request import LIST_MAX, check_capacity, check_pair_room, more_room
 from warp_abtree.query.result import Found, Result
 from warp_abtree.query.stage import Array, PairDistance, Rooms, Stage
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
 
-# Face pairs that the float32 stage leaves uncertain: about one in a hundred. The list grows as needed, to twice that,
-# or by so many, or by a quarter, where lists take gigabytes.
-UNCERTAIN_ROOM, UNCERTAIN_MORE = 65536, 2**24
+# Face pairs that the float32 stage leaves uncertain: about one in a hundred. The list grows as needed.
+UNCERTAIN_ROOM = 65536
 
 
 def operator_kernels(device, stages, output: str) -> list:
@@ -395,9 +394,7 @@ class Operator(DeviceMemory):
     def _grow_uncertain(self, read, found: Found) -> Found:
         # How many wait varies for `any`, where the first hit of a pair ends its traversal.
         while 0 < self.rooms.uncertain < min(LIST_MAX, found.totals.uncertain):
-            wanted = found.totals.uncertain
-            more = max(min(wanted, UNCERTAIN_MORE), wanted // 4)
-            self.make_room(uncertain=min(wanted + more, LIST_MAX))
+            self.make_room(uncertain=more_room(found.totals.uncertain))
             self.search()
             found = read()
         return found

@@ -31,8 +31,16 @@ class CapacityError(RuntimeError):
     """A buffer was too small and work was lost; the message names the demand."""
 
 
+# Lists of face pairs grow to twice the demand, by so many, or by a quarter.
+ROOM_MORE = 2**24
+
 # Where all face pairs that may be near are listed, those that are uncertain have this part of the room.
 APART_FOR_UNCERTAIN = 2
+
+
+def more_room(demand: int) -> int:
+    """Return the room that a list is given whose demand has outgrown it."""
+    return min(demand + max(min(demand, ROOM_MORE), demand // 4), LIST_MAX)
 
 
 @dataclass(frozen=True)
