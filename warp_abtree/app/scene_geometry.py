@@ -3,6 +3,8 @@
 The viewer sends these arrays to the browser, and pictures draw them.
 """
 
+from functools import cached_property
+
 import numpy as np
 
 from warp_abtree.app.cli.model_commands import diagonal_of
@@ -34,6 +36,11 @@ class MeshCache:
         self._kept: dict = {}
         self._faces = 0
         self.diagonals = [diagonal_of(model) for model in scene.models]
+
+    @cached_property
+    def contact_query(self) -> ManifoldQuery:
+        """The query of contact points, made when they are first shown."""
+        return ManifoldQuery(self.scene, gap=CONTACT_GAP * min(self.diagonals))
 
     def mesh(self, model: int, lod: int):
         """Return vertices (v, 3), faces (f, 3) and face ids (f,), rising, of a model by index."""
@@ -129,9 +136,8 @@ def nearest_points(scene: Scene, shown, result) -> tuple[np.ndarray, np.ndarray]
 
 def contact_points(cache: MeshCache, shown) -> np.ndarray:
     """Return the contact points of pairs of shown objects, float64 (k, 3). Waits for the device."""
-    query = ManifoldQuery(cache.scene, gap=CONTACT_GAP * min(cache.diagonals))
-    query.grow()
-    found = query.result()
+    cache.contact_query.grow()
+    found = cache.contact_query.result()
     of_shown = np.isin(found.pairs, shown)[found.points["pair"]]
     return found.points["point"][of_shown.all(axis=1)]
 

@@ -14,7 +14,7 @@ def radix_sort(keys: wp.array, values: wp.array, count: int, bits: int):
         keys, values: (2 count,) or more; what lies behind the first count is scratch.
 
     Raises:
-        RuntimeError: Warp did not sort them, twice: it has seen no device while many processes started on one.
+        RuntimeError: Warp did not sort them, twice.
     """
     for _ in range(2):
         ctypes.memset(_error_address(), 0, 1)
