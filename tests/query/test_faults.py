@@ -320,7 +320,7 @@ def test_the_error_names_the_bytes(device, asked, monkeypatch):
     for call in (
         lambda: ab.Query(scene, "faces", pairs=PAIRS, capacity=2**31 - 1),
         lambda: GpuQuery(scene, "faces", pairs=PAIRS, capacity=ab.Buffers(uncertain=2**31 - 1)),
-        lambda: query.resize(2**31 - 1),
+        lambda: query.make_room(hits=2**31 - 1),
     ):
         refused(RuntimeError, f"bytes on device '{device}'", call)
         assert sizes[-1] == 12 * (2**31 - 1)

@@ -207,7 +207,7 @@ class FrameStages:
 
     def has_room(self, found: dict) -> bool:
         """Return whether all buffers had room for what a frame has found, of which this is the summary."""
-        query, room = self.query, self.query.rooms.uncertain
+        query, room = self.query, self.query.list_rooms.uncertain
         return (
             found["launched"] >= 0
             and 0 <= found["pairs"] <= len(query.pairs)
