@@ -90,7 +90,7 @@ def test_parts_find_the_same_bytes(device, monkeypatch, name, solids, given):
 
 def ask_in_parts(device, monkeypatch, **options):
     """Return a scene, its poses, and a query of it in parts, after its first round."""
-    shorten_lists(monkeypatch)
+    shorten_lists(monkeypatch, 300, 8000)
     scene, poses = grid(device)
     query = ab.ManifoldQuery(scene, None, ab.Buffers(100, 200, 100), gap=GAP, **options)
     query.run()

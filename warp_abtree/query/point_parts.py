@@ -14,9 +14,9 @@ from warp_abtree.query.request import Buffers
 from warp_abtree.query.stage import Array, Rooms, Stage
 from warp_abtree.query.stages.intersect import GapStage
 
-# Entries of the lists of hits, and of face pairs that may be near, beyond which parts of the pairs take turns: some 250
+# Entries of the lists of hits, and of face pairs that may be near, beyond which parts of the pairs take turns: some 500
 # and 400 MB.
-HITS_AT_ONCE, UNCERTAIN_AT_ONCE = 2**20, 2**24
+HITS_AT_ONCE, UNCERTAIN_AT_ONCE = 2**21, 2**24
 
 
 class PartGaps(GapStage):

@@ -290,13 +290,14 @@ class ManifoldQuery(Operator):
 
     def make_list_room(self, hits=None, uncertain=None):
         """Make room for longer lists; those beyond some length serve parts of the pairs, one after the other."""
+        some = None if hits is None else hits // self.growth * 5 // 4  # of lists that are long
         if self.parts is not None:
-            self.parts.make_room(hits, uncertain)
-        elif needs_parts(self.rooms.pairs, hits or 0, uncertain or 0):
+            self.parts.make_room(some, uncertain)
+        elif needs_parts(self.rooms.pairs, some or 0, uncertain or 0):
             gap = None if self.hits.gap is None else PartGaps()
             surfaces = None if self._originals is None else OriginalStage(self._originals.finest)
             stages = self._plan(gap, None if self.memory is None else gap, None, surfaces)
-            self.parts = PointParts(self, stages, hits or self.rooms.hits, uncertain or self.rooms.uncertain)
+            self.parts = PointParts(self, stages, some or self.rooms.hits, uncertain or self.rooms.uncertain)
         else:
             super().make_list_room(hits, uncertain)
             return
