@@ -15,8 +15,8 @@ from warp_abtree.query.stage import Array, Rooms, Stage
 from warp_abtree.query.stages.intersect import GapStage
 
 # Entries of the lists of hits, and of face pairs that may be near, beyond which parts of the pairs take turns: some 500
-# and 400 MB.
-HITS_AT_ONCE, UNCERTAIN_AT_ONCE = 2**21, 2**24
+# and 600 MB.
+HITS_AT_ONCE, UNCERTAIN_AT_ONCE = 2**21, 2**25
 
 
 class PartGaps(GapStage):
