@@ -5,12 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.app.cli.arguments import Parser, positive_count
-from warp_abtree.app.cli.model_commands import load_model, lod_at
+from warp_abtree.app.cli.model_commands import load_models, lod_at
 from warp_abtree.app.playback import MeshPlayback, Playback, ScenePlayback
 from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.scene_file import load_assembly, load_scene
 from warp_abtree.interop.scenes import is_assembly
-from warp_abtree.model.model import Model
 from warp_abtree.scene.scene import Scene
 
 OVERLAP = 0.25  # of the smaller extent: by so much a mesh without a pose reaches into the one before
@@ -19,10 +18,8 @@ OVERLAP = 0.25  # of the smaller extent: by so much a mesh without a pose reache
 def open_playback(paths, device=None, progress=None, objects=None, poses=(), lod=None) -> Playback:
     """Open one scene file (.toml), one file of several objects, or meshes and built models (.npz).
 
-    Args:
-        device, progress, objects: As for `load_scene`; objects for scene files alone.
-        poses: Of the meshes after the first, (k, 7); those left out are laid beside the mesh before, a little inside.
-        lod: LOD of every mesh as for `resolve_lod`; None is the finest.
+    Poses (k, 7) are of the meshes after the first; those left out are laid beside the mesh before, a little inside.
+    `lod` is of every mesh, None the finest; `objects` is for scene files alone, as for `load_scene`.
     """
     paths = [str(find_scene(path)) for path in paths]
     scenes = [path for path in paths if Path(path).suffix.lower() == ".toml"]
@@ -44,11 +41,7 @@ def _open_meshes(paths, device, progress, poses, lod) -> MeshPlayback:
     if len(poses) >= len(paths):
         raise ValueError(f"--pose: {len(poses)} given for the {len(paths) - 1} meshes after the first")
     Scene(device=device)  # refuses a device that does not exist before models are built
-    known: dict[str, Model] = {}
-    for path in paths:
-        if path not in known:
-            known[path] = load_model(path, progress)
-    models = [known[path] for path in paths]
+    models = load_models(paths, progress)
     lods = [lod_at("--lod", model, "finest" if lod is None else lod) for model in models]
     places = row_poses(models)
     if len(poses):

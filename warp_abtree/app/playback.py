@@ -19,12 +19,8 @@ OWN_MODE, HOLD_MODE = "scene", "hold"  # LODs as the scene chooses them, and as 
 class Playback:
     """A scene that runs: each step is a frame, timed by stage.
 
-    Attributes:
-        worlds: World of each object, int (n,); -1 is in every one.
-        view: eye and up, directions, and world, to begin with.
-        camera: Called with a time [s], returns the `Camera` that LODs are for; or None.
-        chosen: LOD of every object, int (n,).
-        mode: Of choosing LODs, one of `modes`.
+    `view` is its `SceneView` to begin with, `camera` called with a time [s] returns the one that LODs are for, `chosen`
+    are the LODs of all objects, and `mode` of `modes` is how they are chosen.
     """
 
     def __init__(self, scene, title, worlds, time_step, view, camera=None, control=None):
@@ -43,7 +39,7 @@ class Playback:
         raise NotImplementedError
 
     def restart(self):
-        """Go back to the start; the mode of choosing LODs stays."""
+        """Go back to the start, in the same mode."""
         self._frame, self._bodies, self._own = self._begin()
         self.number, self.chosen, self._first = 0, self.scene.lods, self.scene.lods
         self._poses = self._poses_now()

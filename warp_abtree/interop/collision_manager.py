@@ -7,12 +7,66 @@ import numpy as np
 
 from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.checks.device_memory import DeviceMemory
-from warp_abtree.interop.collision_data import ContactData, DistanceData
 from warp_abtree.interop.placed_shapes import PlacedShapes, shape_of
 from warp_abtree.state.poses import check_poses
 
 EXTERNAL = "__external"  # trimesh's name for a mesh that is not in the manager
 FIRST_PAIRS = 64  # tested first if one collision is enough
+
+
+class PairData:
+    """Two named objects and a face of each."""
+
+    __slots__ = ("_faces", "names")
+
+    def __init__(self, names, faces):
+        self.names = set(names)
+        self._faces = dict(zip(names, faces))
+
+    def index(self, name) -> int:
+        """Return the index of the named object's face in its mesh."""
+        return self._faces[name]
+
+
+class ContactData(PairData):
+    """One contact, as trimesh.collision.ContactData.
+
+    Attributes:
+        names: Names of the two objects, a set.
+        point: Midpoint of the segment [world units], float64 (3,).
+        normal: Unit normal from the first object of the pair to the second, float64 (3,).
+        depth: How far the deepest point of one object inside the other, a solid, is from the surface; of surfaces, how
+            deep the two faces are in one another [world units].
+        segment: End points of the segment in which the two faces intersect; where one object is wholly inside the
+            other, that deepest point and the surface's nearest one [world units], float64 (2, 3).
+    """
+
+    __slots__ = ("depth", "normal", "point", "segment")
+
+    def __init__(self, names, faces, segment, normal, depth):
+        super().__init__(names, faces)
+        self.segment, self.normal, self.depth = segment, normal, depth
+        self.point = 0.5 * (segment[0] + segment[1])
+
+
+class DistanceData(PairData):
+    """The nearest points of two objects, as trimesh.collision.DistanceData.
+
+    Attributes:
+        names: Names of the two objects, a set.
+        distance: Distance between them [world units]; 0 if they intersect.
+    """
+
+    __slots__ = ("_points", "distance")
+
+    def __init__(self, names, faces, points, distance):
+        super().__init__(names, faces)
+        self._points = dict(zip(names, points))
+        self.distance = distance
+
+    def point(self, name) -> np.ndarray:
+        """Return the nearest point of the named object [world units], float64 (3,)."""
+        return self._points[name]
 
 
 def _join(first, *rest):

@@ -13,14 +13,7 @@ PAIRS_AT_ONCE = 2**16  # pairs whose corners are compared at a time
 
 
 class Shape:
-    """A model and its original mesh on the host, float64, model frame.
-
-    Attributes:
-        model: `Model`.
-        is_closed: Whether it may be a solid.
-        middle, half: Centre and half extents of its box, (3,) each.
-        corners: Extreme corners along each axis in both directions, (6, 3).
-    """
+    """A model, and in its frame the centre and half extents of its box, (3,), and its extreme corners, (6, 3)."""
 
     def __init__(self, model):
         self.model = model

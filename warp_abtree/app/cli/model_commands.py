@@ -27,11 +27,13 @@ def is_model(source) -> bool:
     return source.lower().endswith(".npz")
 
 
-def load_model(source, progress) -> Model:
-    """Open a built model, or build one of a mesh; say on stderr if it is of several parts."""
-    model = Model.open(source) if is_model(source) else Model.load(source, progress=progress)
-    tell_joined(source, model, progress)
-    return model
+def load_models(sources, progress) -> list[Model]:
+    """Open built models, or build them of meshes, each source once; say on stderr which are of several parts."""
+    known = {}
+    for source in dict.fromkeys(sources):
+        known[source] = Model.open(source) if is_model(source) else Model.load(source, progress=progress)
+        tell_joined(source, known[source], progress)
+    return [known[source] for source in sources]
 
 
 def tell_joined(source, mesh, progress):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.app.cli.arguments import LOD_HELP, MESHES, PRECISION_NAMES, Parser
-from warp_abtree.app.cli.model_commands import diagonal_of, is_model, load_model, lod_at
+from warp_abtree.app.cli.model_commands import diagonal_of, is_model, load_models, lod_at
 from warp_abtree.app.cli.report import check_output, print_result, show_number
 from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.scene_file import load_scene
@@ -153,8 +153,7 @@ def _list_options(options) -> dict:
 def _make_scene(options, progress):
     """Return a scene of both meshes, and their models."""
     scene = Scene(device=options.device)
-    models = [load_model(options.a, progress)]
-    models.append(models[0] if options.b == options.a else load_model(options.b, progress))
+    models = load_models([options.a, options.b], progress)
     progress.close()
     named = zip(("--lod-a", "--lod-b"), models, (options.lod_a, options.lod_b))
     lods = [lod_at(name, model, lod or "finest") for name, model, lod in named]
@@ -173,11 +172,7 @@ def _named(row, names=None) -> dict:
 
 
 def record_found(found, path: Path):
-    """Write the result of a query of one object pair; the file appears whole or not at all.
-
-    A .npz file holds the arrays of `Result` by their names. A .csv file has a row for each face pair, with its contact
-    if there is one; the summary over an object pair has no place there.
-    """
+    """Write the arrays of a `Result` to a .npz file, or a row for each face pair of one object pair to a .csv file."""
     if path.suffix.lower() == ".npz":
         names = (*RESULT_ARRAYS, "count")
         arrays = {name: getattr(found, name) for name in names if getattr(found, name) is not None}

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from warp_abtree.app.cli.arguments import PRECISION_NAMES, Parser, positive_count
-from warp_abtree.app.cli.model_commands import load_model, lod_at
+from warp_abtree.app.cli.model_commands import load_models, lod_at
 from warp_abtree.app.cli.query_command import OUTPUTS
 from warp_abtree.app.cli.report import print_result
 from warp_abtree.app.toml.scene_file import load_scene
@@ -69,13 +69,12 @@ def run_sweep(options, progress):
         raise ValueError("--device: Ray places workers on GPUs, or CPUs where there is none; it goes with --ray none")
     if not with_ray and options.workers:
         raise ValueError("--workers: they are Ray's")
-    named = {"progress": progress}
     if with_ray:
         # Ray tells of workers that end on stdout, which is for what this command prints.
         with contextlib.redirect_stdout(sys.stderr), RayPool(options.ray, options.workers) as pool:
-            done = run_shards(job, options.out, pool=pool, **named)
+            done = run_shards(job, options.out, pool, progress)
     else:
-        done = run_shards(job, options.out, pool=ThisProcess(options.device and options.device.split(",")), **named)
+        done = run_shards(job, options.out, ThisProcess(options.device and options.device.split(",")), progress)
     progress.close()
     seconds = time.perf_counter() - begin
     print_result({"out": str(options.out), "unit": "pose", **done, "seconds": seconds}, options.json)
@@ -87,8 +86,7 @@ def _make_job(options, progress) -> SweepJob:
         raise ValueError("POSES.npy is missing: two models are asked at poses")
     poses = source.pop()
     if len(source) == 2:
-        models = [load_model(source[0], progress)]
-        models.append(models[0] if source[1] == source[0] else load_model(source[1], progress))
+        models = load_models(source, progress)
         lods = [model.lod_max for model in models]
     elif len(source) == 1:
         if Path(source[0]).suffix.lower() not in ("", ".toml"):

@@ -4,24 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from warp_abtree.app.pictures.render import BACKGROUND, write_png
+from warp_abtree.app.pictures.render import figure_image, new_figure, write_png
 from warp_abtree.app.styles import STAGE_LABELS
 from warp_abtree.simulate.frame_row import FrameRow
 
 
-def _make_figure(size, title):
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, dpi=100, facecolor=BACKGROUND, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, fontsize=14, fontweight="bold", color="0.15")
-    return figure
-
-
 def draw_run(rows: list[FrameRow], fractions, path, title: str):
     """Draw LODs (fractions of the finest, (frames, n)), times by stage and certified error of a run to a PNG file."""
-    figure = _make_figure((10, 10), title)
+    figure = new_figure((10, 10), layout="constrained")
+    figure.suptitle(title, fontsize=14, fontweight="bold", color="0.15")
     lods, times, errors = figure.subplots(3, 1, sharex=True)
     frames = np.array([row.frame for row in rows])
 
@@ -50,5 +41,4 @@ def draw_run(rows: list[FrameRow], fractions, path, title: str):
     for axes in (lods, times, errors):
         axes.grid(True, alpha=0.3)
         axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-    figure.canvas.draw()
-    write_png(np.asarray(figure.canvas.buffer_rgba())[:, :, :3].copy(), path)
+    write_png(figure_image(figure), path)

@@ -148,23 +148,9 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
     _check_memory(path, tables, len(motion.position))
     models = {name: build_model(path, name, table, progress) for name, table in tables.models.items()}
     owners = _add_objects(path, scene, groups, models)
-    loaded = SceneFile(
-        path=path,
-        title=path.stem if tables.scene.title is None else tables.scene.title,
-        frames=tables.scene.frames,
-        time_step=tables.scene.time_step,
-        models=models,
-        scene=scene,
-        motion=motion,
-        worlds=np.concatenate([group.world for group in groups]),
-        base_lods=scene.lods.astype(np.int64),
-        sweeps=[_make_sweep(table, models, owners) for table in tables.lod_sweep],
-        picture=tables.picture,
-        camera=tables.camera,
-        control=control,
-        dynamics=tables.dynamics,
-        kinematic=np.concatenate([group.kinematic for group in groups]),
-    )
+    sweeps = [_make_sweep(table, models, owners) for table in tables.lod_sweep]
+    worlds, kinematic = (np.concatenate([getattr(g, name) for g in groups]) for name in ("world", "kinematic"))
+    loaded = _loaded(path, tables, scene, models, motion, worlds, kinematic, control, sweeps)
     scene.set_lods(loaded.lods_at(0.0))
     scene.set_poses(motion.poses(0.0))
     return loaded
@@ -175,22 +161,28 @@ def load_assembly(path: Path, device=None, progress=None) -> SceneFile:
     tables = read_tables(path, "models = {}")  # all that a file may leave out
     scene = scene_from_file(path, device, progress=progress)
     poses = scene.poses
+    models = {scene.name(scene.object_model.index(k)): model for k, model in enumerate(scene.models)}
+    motion, still = Kinematic(poses[:, :3], poses[:, 3:]), np.zeros(scene.object_count, bool)
+    return _loaded(path, tables, scene, models, motion, scene.worlds, still, make_control(path, None), [])
+
+
+def _loaded(path, tables, scene, models, motion, worlds, kinematic, control, sweeps) -> SceneFile:
     return SceneFile(
         path=path,
-        title=path.stem,
+        title=path.stem if tables.scene.title is None else tables.scene.title,
         frames=tables.scene.frames,
         time_step=tables.scene.time_step,
-        models={scene.name(scene.object_model.index(k)): model for k, model in enumerate(scene.models)},
+        models=models,
         scene=scene,
-        motion=Kinematic(poses[:, :3], poses[:, 3:]),
-        worlds=scene.worlds,
+        motion=motion,
+        worlds=worlds,
         base_lods=scene.lods.astype(np.int64),
-        sweeps=[],
+        sweeps=sweeps,
         picture=tables.picture,
-        camera=None,
-        control=make_control(path, None),
-        dynamics=None,
-        kinematic=np.zeros(scene.object_count, bool),
+        camera=tables.camera,
+        control=control,
+        dynamics=tables.dynamics,
+        kinematic=kinematic,
     )
 
 

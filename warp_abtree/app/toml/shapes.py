@@ -4,6 +4,12 @@ import numpy as np
 import trimesh
 
 
+def _halve_quads(*corners) -> list[np.ndarray]:
+    """Return the two triangles of each of some quadrangles a b c d, of which four arrays hold the vertices."""
+    a, b, c, d = (array.ravel() for array in corners)
+    return [np.stack([a, b, c], 1), np.stack([a, c, d], 1)]
+
+
 def _wrap(points, closed):
     """Return a surface over a grid of rings: each is closed, and all are if `closed`, else ended by two poles.
 
@@ -14,8 +20,7 @@ def _wrap(points, closed):
     i, j = np.meshgrid(np.arange(rings if closed else rings - 1), np.arange(sections), indexing="ij")
     here, there = i * sections, (i + 1) % rings * sections
     after = (j + 1) % sections
-    a, b, c, d = (x.ravel() for x in (here + j, here + after, there + after, there + j))
-    faces = [np.stack([a, b, c], 1), np.stack([a, c, d], 1)]
+    faces = _halve_quads(here + j, here + after, there + after, there + j)
     vertices = [points.reshape(-1, 3)]
     if not closed:
         vertices += [points[0].mean(0)[None], points[-1].mean(0)[None]]
@@ -49,8 +54,8 @@ def terrain(extents, cells, bumps, waves, rim):
     y = bumps * np.sin(np.pi * waves * x) * np.cos(np.pi * waves * z) + rim * (x**6 + z**6)
     vertices = np.stack([x * extents[0] / 2, y, z * extents[1] / 2], -1).reshape(-1, 3)
     number = np.arange(len(vertices)).reshape(x.shape)
-    a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    return trimesh.Trimesh(vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), process=False)
+    faces = _halve_quads(number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1])
+    return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
 
 
 def _thread(height, turn, pitch):

@@ -41,12 +41,10 @@ def make_surroundings(world, device) -> tuple[Scene | None, tuple]:
 
 
 class RobotBatch:
-    """The batch of what surrounds a robot, a `Scene` at its LODs or None, and of the parts of a number of robots.
+    """The `batch` of what surrounds a robot, a `Scene` at its LODs or None, and of the parts of a number of robots.
 
-    Attributes:
-        batch: `Batch`; objects of the surroundings come first.
-        count: Objects of the surroundings.
-        meets: Whether the bits of each of these let it meet the robot, whose group is 1, with every bit in its mask.
+    The `count` objects of the surroundings come first; `meets` is whether the bits of each let it meet the robot, whose
+    group is 1, with every bit in its mask.
     """
 
     def __init__(self, around: Scene | None, models: list[Model], room: int, device):
