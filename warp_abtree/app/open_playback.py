@@ -59,7 +59,7 @@ def add_playback_arguments(sub: Parser):
     about = "pose of the second mesh, again for the third; without it each stands beside the one before, a bit inside"
     sub.add_pose(about, action="append", default=[])
     sub.add_argument("--lod", metavar="LOD", help="LOD of meshes, as for query (finest)")
-    sub.add_argument("--objects", type=positive_count, metavar="N", help="about so many objects of a scene, as for run")
+    sub.add_number("--objects", "about so many objects of a scene, as for run", positive_count)
 
 
 def row_poses(models) -> np.ndarray:

@@ -45,6 +45,14 @@ class Parser(argparse.ArgumentParser):
             action.complete = {**action.complete, **dict.fromkeys(("bash", "zsh"), SCENES_FUNCTION)}
             action.complete["fish"] = " ".join(("(__fish_complete_path)", *scene_names()))
 
+    def add_flag(self, name: str, about: str, default: bool | None = False):
+        """Add an option that is true where it is given."""
+        self.add_argument(name, action="store_true", default=default, help=about)
+
+    def add_number(self, name: str, about: str, kind=float, default=None):
+        """Add an option of a number, or of a whole number by `positive_count`."""
+        self.add_argument(name, type=kind, default=default, metavar="X" if kind is float else "N", help=about)
+
     def add_pose(self, about: str, **options):
         """Add `--pose`, a position and a quaternion."""
         names = ("X", "Y", "Z", "QX", "QY", "QZ", "QW")

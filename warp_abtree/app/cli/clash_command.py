@@ -159,11 +159,9 @@ def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
     sub.add_file("assembly", metavar="ASSEMBLY", help="GLB, glTF, USD, 3MF, STEP, or OBJ with an `o` line a part")
     about = "list pairs no farther apart than this too [file's units] (0: what meets alone)"
-    sub.add_argument("--within", type=float, default=0.0, metavar="X", help=about)
-    about = (
-        f"depth and distance up to which parts touch [file's units] ({TOUCH_TOLERANCE:g} of the assembly's diagonal)"
-    )
-    sub.add_argument("--tolerance", type=float, metavar="X", help=about)
+    sub.add_number("--within", about, default=0.0)
+    about = "depth and distance up to which parts touch [file's units]"
+    sub.add_number("--tolerance", f"{about} ({TOUCH_TOLERANCE:g} of the assembly's diagonal)")
     sub.add_file("--csv", type=Path, metavar="FILE", help="write a row a pair")
     sub.add_file("--picture", type=Path, metavar="PNG", help="draw the assembly, what interferes coloured")
     sub.add_file("--glb", type=Path, metavar="FILE", help="write the assembly, faces that interfere in red")

@@ -44,7 +44,7 @@ def make_parser() -> argparse.ArgumentParser:
         )
         sub.set_defaults(function=function)
         sub.add_argument("--device", help='Warp device, "cpu" or "cuda:0"; by default the first GPU, else the CPU')
-        sub.add_argument("--json", action="store_true", help="print JSON")
+        sub.add_flag("--json", "print JSON")
         add_arguments(sub)
 
     models = model_commands

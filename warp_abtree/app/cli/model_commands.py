@@ -88,12 +88,8 @@ def add_build_arguments(sub: Parser):
     """Add the arguments of `build`."""
     sub.add_file("mesh", metavar="MESH", nargs="+", help=f"{MESHES}; one after another")
     sub.add_file("out", metavar="OUT", type=Path, help="file to write (.npz), or a folder for NAME.npz of each mesh")
-    sub.add_argument(
-        "--base-faces", type=positive_count, default=10, metavar="N", help="faces of the coarsest LOD (10)"
-    )
-    sub.add_argument(
-        "--orient", action="store_true", help="turn faces that disagree with neighbours or point into the solid"
-    )
+    sub.add_number("--base-faces", "faces of the coarsest LOD (10)", positive_count, 10)
+    sub.add_flag("--orient", "turn faces that disagree with neighbours or point into the solid")
 
 
 def build(options, progress):

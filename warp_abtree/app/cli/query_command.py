@@ -42,16 +42,12 @@ def add_arguments(sub: Parser):
     sub.add_argument("--output", choices=OUTPUTS, default="count", help="what to ask (count)")
     about = "signs of determinants: exact, or of the rounded ones (exact)"
     sub.add_argument("--precision", choices=PRECISION_NAMES, default="exact", help=about)
-    about = "width of the bracket that ends the search of a distance (0)"
-    sub.add_argument("--tolerance", type=float, metavar="X", help=about)
-    sub.add_argument("--relative", type=float, metavar="X", help="the same as a fraction of the distance (0)")
-    sub.add_argument("--beyond", type=float, metavar="X", help="distance that is far enough (none)")
-    about = "the distance of the original meshes, at whatever LODs A and B stand"
-    sub.add_argument("--originals", action="store_true", default=None, help=about)
-    about = "negative distances, as deep as the deepest point of one solid in the other"
-    sub.add_argument("--signed", action="store_true", default=None, help=about)
-    about = "what lies inside A or B, or objects of the scene, closed meshes, intersects it"
-    sub.add_argument("--solid", action="store_true", help=about)
+    sub.add_number("--tolerance", "width of the bracket that ends the search of a distance (0)")
+    sub.add_number("--relative", "the same as a fraction of the distance (0)")
+    sub.add_number("--beyond", "distance that is far enough (none)")
+    sub.add_flag("--originals", "the distance of the original meshes, at whatever LODs A and B stand", None)
+    sub.add_flag("--signed", "negative distances, as deep as the deepest point of one solid in the other", None)
+    sub.add_flag("--solid", "what lies inside A or B, or objects of the scene, closed meshes, intersects it")
     about = "write face pairs and contacts as .csv, of a scene its object pairs, or the whole result as .npz"
     sub.add_file("--record", type=Path, metavar="FILE", help=about)
 

@@ -24,13 +24,9 @@ EXAMPLES = (
 
 def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
-    sub.add_scene(
-        "source",
-        nargs="+",
-        metavar="SCENE_OR_MODELS",
-        help="two meshes or models and POSES.npy, (p, 7) or (p, 4, 4) poses of the second in the frame of the first; "
-        "or a scene of two objects and POSES.npy",
-    )
+    about = "two meshes or models and POSES.npy, (p, 7) or (p, 4, 4) poses of the second in the frame of the first; "
+    about += "or a scene of two objects and POSES.npy"
+    sub.add_scene("source", nargs="+", metavar="SCENE_OR_MODELS", help=about)
     sub.add_file("--out", "-o", type=Path, required=True, metavar="DIR", help="folder to make, or to go on in")
     sub.add_argument("--output", choices=(*OUTPUTS, "first_contact"), default="any", help="what to ask (any)")
     sub.add_argument("--precision", choices=PRECISION_NAMES, default="exact", help="as query (exact)")
@@ -38,21 +34,14 @@ def add_arguments(sub: Parser):
         sub.add_argument(f"--lod-{name}", metavar="LOD", help=f"LOD of {name.upper()}, as query (finest)")
     sub.add_file("--lods", type=Path, metavar="LODS.npy", help="LODs of both at each pose, (p, 2)")
     sub.add_file("--ends", type=Path, metavar="ENDS.npy", help="end poses of first_contact, as POSES.npy")
-    sub.add_argument("--solid", action="store_true", help="what lies inside A or B, closed meshes, intersects it")
-    about = "whether any or count are proved farther apart than X, too"
-    sub.add_argument("--within", type=float, metavar="X", help=about)
-    about = "what a distance, or a time of first contact, may be off by (0, 1e-6)"
-    sub.add_argument("--tolerance", type=float, metavar="X", help=about)
-    sub.add_argument("--beyond", type=float, metavar="X", help="distance that is far enough (none)")
-    sub.add_argument("--shard", type=positive_count, default=65536, metavar="N", help="poses a file (65536)")
-    sub.add_argument(
-        "--ray",
-        metavar="ADDRESS",
-        help='of a Ray cluster (Ray is started here). "none": this process, with --device cuda:0,cuda:1 on two',
-    )
-    sub.add_argument(
-        "--workers", type=positive_count, metavar="N", help="Ray workers (as many as GPUs, or else CPU cores)"
-    )
+    sub.add_flag("--solid", "what lies inside A or B, closed meshes, intersects it")
+    sub.add_number("--within", "whether any or count are proved farther apart than X, too")
+    sub.add_number("--tolerance", "what a distance, or a time of first contact, may be off by (0, 1e-6)")
+    sub.add_number("--beyond", "distance that is far enough (none)")
+    sub.add_number("--shard", "poses a file (65536)", positive_count, 65536)
+    about = 'of a Ray cluster (Ray is started here). "none": this process, with --device cuda:0,cuda:1 on two'
+    sub.add_argument("--ray", metavar="ADDRESS", help=about)
+    sub.add_number("--workers", "Ray workers (as many as GPUs, or else CPU cores)", positive_count)
 
 
 def run_sweep(options, progress):

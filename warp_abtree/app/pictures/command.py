@@ -33,8 +33,7 @@ def add_arguments(sub: Parser):
     sub.add_argument("--every", type=positive_count, default=1, metavar="K", help="of these, draw each K-th (1)")
     for name, what in (("eye", "direction to the eye"), ("up", "direction upwards")):
         sub.add_argument(f"--{name}", nargs=3, type=float, metavar=("X", "Y", "Z"), help=f"{what} (the scene's own)")
-    about = "draw distances between objects: of few all, of more those whose boxes overlap"
-    sub.add_argument("--distances", action="store_true", help=about)
+    sub.add_flag("--distances", "draw distances between objects: of few all, of more those whose boxes overlap")
     sub.add_argument("--world", type=int, metavar="W", help="world to draw (the scene's own)")
     sub.add_argument("--size", type=positive_count, default=SIZE, metavar="PX", help=f"pixels along a side ({SIZE})")
 
