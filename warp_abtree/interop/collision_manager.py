@@ -83,22 +83,18 @@ class CollisionManager(DeviceMemory):
     pair, and a `DistanceData`, both None where there is no pair. All of them wait for the device. Closed meshes are
     solids, all others surfaces. Differences:
 
-    * Answers are exact for the given poses (FCL rounds those of `add_object` to float32 and tests convex meshes
-      iteratively). Touching is a collision. What lies inside any closed mesh collides with it, not only inside a convex
-      one.
-    * A contact is a pair of intersecting faces with their indices, also of convex meshes. Its depth is that of the pair
-      of objects if one is a solid that holds points of the other: how far the deepest of these is from the surface
-      (`query.stages.distance`); else how deep the two faces are in one another. An object wholly inside a solid
-      gives one contact, whose segment joins that deepest point and the surface.
-    * Distances [world units] are negative where solids are deep in one another, by that depth, a lower bound of the
-      penetration depth; 0 where surfaces merely intersect, infinite if there are no objects. They are exact to the
-      rounding of coordinates, for convex meshes too.
+    * Answers are exact for the given poses, also of convex meshes. Touching is a collision, and so is what lies inside
+      any closed mesh.
+    * A contact is a pair of intersecting faces, see `ContactData`. An object wholly inside a solid gives one, whose
+      segment joins its deepest point and the surface.
+    * Distances [world units] are negative where solids are deep in one another, by how far the deepest point of one in
+      the other is from the surface (`query.stages.distance`), a lower bound of the penetration depth; 0 where surfaces
+      merely intersect, infinite if there are no objects.
     * Transforms must be rigid within 1e-6; an object of the same name is replaced; `add_object` returns nothing.
 
-    Cost: meshes are prepared once for all managers, by content. The first call after `add_object` of a mesh without a
-    free slot uploads all models again; so do the first `in_collision_single` of a new mesh and `in_collision_other` of
-    new meshes. Other calls upload poses only. A removed object leaves a slot for another of the same mesh; free slots
-    are released when they outnumber objects, and 16.
+    Cost: meshes are prepared once for all managers, by content. The first call after a new mesh, of `add_object`,
+    `in_collision_single` or `in_collision_other`, uploads all models again, others poses only. A removed object leaves
+    a slot for another of the same mesh; free slots are released when they outnumber objects, and 16.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0"; None for Warp's default.

@@ -1,15 +1,10 @@
 """Contacts for Newton's solvers: `NewtonContacts` fills a `newton.Contacts` from meshes that are near or intersect.
 
 Its `collide` stands in the place of that of a `newton.CollisionPipeline`: the poses of bodies are copied to a scene's
-objects, `ManifoldQuery` finds the contact points, and these are written in Newton's conventions: shapes, points and
-offsets in body frames, normals from the first shape to the second. Everything stays on the device, in the order of
-pairs, and is deterministic.
-
-As Newton has it, two shapes have contacts where their distance is under the sum of both margins and both gaps
-(`ShapeConfig`), and rest with both margins between them. Newton's own gap of 0.1 m a shape makes very many contacts of
-fine meshes: give one that bodies move in a step. Depths and normals are those of `query.stages.points`. Pairs of
-shapes of which one is no mesh, and particles, are passed to a pipeline of Newton's, whose contacts come first. Tested
-with Newton 1.8 (extra `newton`), which calls its contacts experimental.
+objects, `ManifoldQuery` finds the contact points, and these are written in Newton's conventions: points and offsets in
+body frames, normals from the first shape to the second, contacts where shapes are nearer than both margins and gaps.
+Everything stays on the device, in the order of pairs, and is deterministic. Pairs of which one is no mesh, and
+particles, are passed to a pipeline of Newton's, whose contacts come first. Tested with Newton 1.8 (extra `newton`).
 """
 
 from typing import Any

@@ -97,12 +97,11 @@ def record_pair_distance(tape: wp.Tape, query: DistanceQuery, poses: wp.array) -
             float64, or Warp's transforms or matrices (n,).
 
     Returns:
-        Distances, float64 (p,), with a gradient. That by a quaternion is of the normalised one, and that by a matrix
-        within the rigid motions.
+        Distances, float64 (p,), with a gradient, as that of `interop.torch.pair_distance`.
 
     Raises:
-        TypeError, ValueError, RuntimeError: As `check_query` and `PosedDistances`; no tape; or poses of another shape,
-            count, type or device, or without a gradient. No object has moved.
+        TypeError, ValueError, RuntimeError: As `interop.torch.pair_distance`; no tape; or poses without a gradient. No
+            object has moved.
     """
     if not isinstance(tape, wp.Tape):
         raise TypeError(f"tape: a wp.Tape is expected, not a {type(tape).__name__}")

@@ -67,21 +67,17 @@ def info(options, progress):
     """Print what a mesh file or a built model holds."""
     Scene(device=options.device)
     if is_model(options.mesh):
-        found = _describe_model(options.mesh)
+        model = Model.open(options.mesh)
+        forest = model.progressive
+        found = describe_mesh(mesh_from_arrays(forest.vertex_pos[: model.vertex_count], forest.face_vertex, model.name))
+        for key in ("parts", "file_vertices", "unreferenced_vertices", "welded_vertices"):
+            del found[key]  # a model does not keep them
+        found |= {"lods": model.lod_max + 1, "base_faces": forest.active_count(0)}
     else:
         mesh = load_mesh(options.mesh)
         tell_joined(options.mesh, mesh, progress)
         found = describe_mesh(mesh)
     print_result(found, options.json)
-
-
-def _describe_model(path) -> dict:
-    model = Model.open(path)
-    forest = model.progressive
-    found = describe_mesh(mesh_from_arrays(forest.vertex_pos[: model.vertex_count], forest.face_vertex, model.name))
-    for key in ("parts", "file_vertices", "unreferenced_vertices", "welded_vertices"):
-        del found[key]  # a model does not keep them
-    return found | {"lods": model.lod_max + 1, "base_faces": forest.active_count(0)}
 
 
 def add_build_arguments(sub: Parser):

@@ -145,7 +145,10 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
         motion = Kinematic(**{key: np.concatenate([group.motion[key] for group in groups]) for key in groups[0].motion})
     except ValueError as error:  # a sum of finite numbers that is not
         fail(path, "objects", error)
-    _check_memory(path, tables, len(motion.position))
+    check_faces(path, tables.models)
+    count, window = len(motion.position), 1 if tables.lod is None else tables.lod.window or 1
+    if window * count > MOTION_LIMIT:
+        fail(path, "lod.window", f"{window:,} frames of {count:,} objects are more than {MOTION_LIMIT:,} together")
     models = {name: build_model(path, name, table, progress) for name, table in tables.models.items()}
     owners = _add_objects(path, scene, groups, models)
     sweeps = [_make_sweep(table, models, owners) for table in tables.lod_sweep]
@@ -206,14 +209,6 @@ def _check_names(path, tables):
                 fail(path, f"lod_sweep[{i}].objects", f"no object is named {name!r}")
     if tables.lod_sweep and tables.lod is not None:
         fail(path, "lod", "LODs are swept, or chosen by a controller, not both")
-
-
-def _check_memory(path, tables, count):
-    """Refuse what would exhaust the memory although each number is within its own limits."""
-    check_faces(path, tables.models)
-    window = 1 if tables.lod is None else tables.lod.window or 1
-    if window * count > MOTION_LIMIT:
-        fail(path, "lod.window", f"{window:,} frames of {count:,} objects are more than {MOTION_LIMIT:,} together")
 
 
 def _add_objects(path, scene, groups, models):

@@ -19,9 +19,14 @@ STRETCHES_MAX, WIDTH_LEAST = 1024, 2.0**-30
 class RobotQuery(LinkQuery):
     """A fixed number of configurations as an operator: allocates once, launches many times.
 
-    `launch()` only launches, so that a CUDA graph can capture it; `configurations`, device float64 (room, n), and the
-    poses of what surrounds the robot, as of the last `take_poses`, are read by each launch. Configurations are taken as
-    they are: those that are not finite meet nothing. `hit` and `nearest` are the answers, see `LinkQuery`.
+    `launch()` only launches, so that a CUDA graph can capture it; `configurations` and the poses of what surrounds the
+    robot, as of the last `take_poses`, are read by each launch. Configurations are taken as they are: those that are
+    not finite meet nothing.
+
+    Attributes:
+        configurations: Device float64 (room, n).
+        hit: Whether parts of each intersect, device uint8 (room,).
+        nearest: Of output "distance", device arrays of `kernels.robot.answers.NearestParts`, else None.
     """
 
     def __init__(self, robot, around, output: str, room: int):

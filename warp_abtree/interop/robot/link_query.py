@@ -62,13 +62,9 @@ class LinkQuery(DeviceMemory):
 
     Attributes:
         active: Configurations that are posed, the room by default.
-        configurations: Device float64 (room, width).
-        hit: Whether parts of each intersect, device uint8 (room,).
-        chunk: `link_pairs.Chunk` of device arrays.
         demand: Pairs of a stage at most, and face pairs that waited, device int32 (2,).
         found: Of "pairs", pairs of objects that intersect, a part first, an array (k, 2) a stage.
         most: Of "distance", what is farther apart is infinitely far.
-        nearest: Of "distance", device arrays of `kernels.robot.answers.NearestParts`, else None.
     """
 
     def __init__(self, robot, around, output: str, room: int):
