@@ -139,7 +139,7 @@ class CollisionManager(DeviceMemory):
         try:
             for _, shape, matrix in guests:
                 slots.append(self._placed.add(shape, matrix))
-            names, own = self._own()
+            names, own = list(self._slots), np.array(list(self._slots.values()), np.int32)
             pairs = np.stack([np.repeat(own, len(slots)), np.tile(np.array(slots, np.int32), len(own))], 1)
             yield pairs, lambda k: (names[k // len(slots)], guests[k % len(slots)][0])
         finally:
@@ -152,9 +152,11 @@ class CollisionManager(DeviceMemory):
             raise ValueError(f"{name} not in collision manager!")
         return self._slots[name]
 
-    def _own(self):
-        """Return the names of all objects and their slots."""
-        return list(self._slots), np.array(list(self._slots.values()), np.int32)
+    def _pairs_within(self):
+        """Return all pairs of slots of objects, and a function of an index that returns the pair's names."""
+        names, own = list(self._slots), np.array(list(self._slots.values()), np.int32)
+        i, j = np.triu_indices(len(own), 1)
+        return np.stack([own[i], own[j]], 1), lambda k: (names[i[k]], names[j[k]])
 
     def _external(self, mesh, transform):
         return [(EXTERNAL, shape_of(mesh, EXTERNAL), self._matrix(transform, EXTERNAL))]
@@ -242,12 +244,9 @@ class CollisionManager(DeviceMemory):
 
         Raises ValueError if no object has this name.
         """
-        names, own = self._own()
-        i, j = np.triu_indices(len(own), 1)
-        if name is not None:
-            asked = (np.stack([own[i], own[j]]) == self._slot(name)).any(0)
-            i, j = i[asked], j[asked]
-        distance, pair, data = self._nearest(np.stack([own[i], own[j]], 1), lambda k: (names[i[k]], names[j[k]]))
+        pairs, names = self._pairs_within()
+        asked = np.arange(len(pairs)) if name is None else np.flatnonzero((pairs == self._slot(name)).any(1))
+        distance, pair, data = self._nearest(pairs[asked], lambda k: names(asked[k]))
         return _join(distance, (return_names, pair and tuple(sorted(pair))), (return_data, data))
 
     def min_distance_other(self, other_manager, return_names=False, return_data=False):
@@ -272,18 +271,17 @@ class CollisionManager(DeviceMemory):
         Raises:
             ValueError: No object has a name, a transform is not rigid within 1e-6, or turns by half a revolution.
         """
-        names, own = self._own()
         ends = np.array(self._placed.poses[: self._placed.scene.object_count]).reshape(-1, 4, 4)
         for name, transform in transforms.items():
             ends[self._slot(name)] = self._matrix(transform, name)
         _, at_first = self.in_collision_internal(return_names=True)
         time, pair = (0.0, min(at_first)) if at_first else (1.0, None)
-        if not at_first and len(own) > 1:
-            i, j = np.triu_indices(len(own), 1)
-            found = self._placed.scene.first_contact(np.stack([own[i], own[j]], 1), ends, tolerance)
+        pairs, names = self._pairs_within()
+        if not at_first and len(pairs):
+            found = self._placed.scene.first_contact(pairs, ends, tolerance)
             k = int(found.time.argmin())
             if not found.clear[k]:
-                time, pair = float(found.time[k]), tuple(sorted((names[i[k]], names[j[k]])))
+                time, pair = float(found.time[k]), tuple(sorted(names(k)))
         return _join(time, (return_names, pair))
 
     # Computation.
@@ -335,8 +333,8 @@ class CollisionManager(DeviceMemory):
         placed = self._placed
         placed.upload()
         gaps = placed.gaps(pairs)
-        _, likely = placed.upper_distance(pairs, gaps)
-        k, result = likely, placed.scene.intersect(pairs[[likely]], "distance")
+        k = likely = placed.find_likely(pairs, gaps)
+        result = placed.scene.intersect(pairs[[likely]], "distance")
         distance, row = float(result.distance[0]), 0
         # Of the others, what is proved farther than that is not searched to its end.
         others = np.flatnonzero(gaps <= distance)

@@ -114,8 +114,8 @@ class PlacedShapes:
         i, j = pairs.T
         return np.linalg.norm(np.maximum(np.abs(middle[i] - middle[j]) - half[i] - half[j], 0), axis=1)
 
-    def upper_distance(self, pairs, gaps):
-        """Return an upper bound on the least distance of all pairs, that of two corners, and the index of its pair."""
+    def find_likely(self, pairs, gaps) -> int:
+        """Return the index of the pair that has the nearest corners, which bounds the least distance of all."""
         corners = np.array([s.corners @ p[:3, :3].T + p[:3, 3] for s, p in zip(self.shapes, self.poses)])
         upper, likely = np.inf, 0
         for start in range(0, len(pairs), PAIRS_AT_ONCE):
@@ -125,4 +125,4 @@ class PlacedShapes:
                 apart = np.linalg.norm(corners[i, :, None] - corners[j, None], axis=-1).min((1, 2))
                 if apart.min() < upper:
                     upper, likely = float(apart.min()), int(part[apart.argmin()])
-        return upper, likely
+        return likely

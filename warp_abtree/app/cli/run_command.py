@@ -11,8 +11,7 @@ import numpy as np
 
 from warp_abtree.app.cli.arguments import PROGRAM, Parser, milliseconds, positive_count
 from warp_abtree.app.cli.report import check_output, print_result
-from warp_abtree.app.pictures.plots import draw_run
-from warp_abtree.app.pictures.render import import_pyvista
+from warp_abtree.app.pictures.render import draw_run, import_pyvista
 from warp_abtree.app.pictures.scenes import draw_scene
 from warp_abtree.app.toml.control import CONTROLLERS
 from warp_abtree.app.toml.folder import scene_names

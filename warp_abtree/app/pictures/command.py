@@ -4,9 +4,9 @@ from pathlib import Path
 
 from warp_abtree.app.cli.arguments import Parser, positive_count
 from warp_abtree.app.cli.report import check_output, print_result
-from warp_abtree.app.open_playback import add_playback_arguments, open_playback
 from warp_abtree.app.pictures.render import import_pyvista
 from warp_abtree.app.pictures.scenes import SIZE, SIZES, draw_frames, draw_snapshot
+from warp_abtree.app.playback import add_playback_arguments, open_playback
 from warp_abtree.app.render_data import Settings, Snapshot, objects_to_draw
 from warp_abtree.app.scene_view import make_view
 from warp_abtree.checks.arguments import whole_number
