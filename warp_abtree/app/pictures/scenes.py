@@ -126,13 +126,8 @@ def panel_lods(loaded) -> list[np.ndarray]:
 def draw_scene(loaded, path, time: float, poses=None, lods=None):
     """Draw a scene file's picture at one time and several LODs: both sides of an LOD switch, the same poses.
 
-    The scene's LODs are what they were afterwards, its poses those of the picture.
-
-    Args:
-        loaded: What `load_scene` returned.
-        time: Time of the poses [s], unless the file's `[picture]` has one.
-        poses: Pose of every object, (n, 7), in the place of those of the time.
-        lods: LOD of every object, (n,), for one panel in the place of the file's.
+    The scene's LODs are what they were afterwards, its poses those of the picture: of a time [s], unless the file's
+    `[picture]` has one, or those given, (n, 7). LODs (n,) are for one panel in the place of the file's.
     """
     scene, view = loaded.scene, loaded.picture
     time = time if view.time is None else view.time
