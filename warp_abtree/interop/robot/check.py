@@ -31,17 +31,29 @@ class RobotQuery(LinkQuery):
 
     def __init__(self, robot, around, output: str, room: int):
         super().__init__(robot, around, output, room)
-        self._around, self._models = self.robots.count, len(robot.models)
+        self._world, self._models = around, len(robot.models)
+        self._world_batch, self._lods = (None, np.zeros(0)) if around is None else (around.batch(), around.lods)
         self._own_names = [robot.link_names[k] for k in robot.model_link]
         self.take_poses()
 
     def take_poses(self):
-        """Read where what surrounds the robot is now. Launches only."""
-        self.robots.take_poses()
+        """Read where what surrounds the robot is now; raise RuntimeError if objects were added to it. Launches only."""
+        if self._world_batch is not None:
+            self._world_batch.check("robot query")
+            source, target = self._world_batch.objects.pool, self.batch.objects.pool
+            wp.copy(target.rotation, source.rotation, count=self.around)
+            wp.copy(target.position, source.position, count=self.around)
+
+    def is_of(self, world) -> bool:
+        """Return whether what surrounds the robot still has the same objects at the same LODs."""
+        if world is None or self._world is not world:
+            return True  # of models that were given again
+        return self._world_batch is world.batch() and np.array_equal(self._lods, world.lods)
 
     def _names(self) -> list[str]:
         """Return the names of models of the robot, of what surrounds it now, and of -1."""
-        return [*self._own_names, *self.robots.names(), ""]
+        around = [] if self._world_batch is None else self._world_batch.names
+        return [*self._own_names, *around, ""]
 
     def check(self):
         """Raise where the last launch lost anything, after making room for the next. Waits for the device.
@@ -81,13 +93,13 @@ class RobotQuery(LinkQuery):
 
     def _number(self, objects) -> np.ndarray:
         """Return objects as indices of models of the robot, and what surrounds it after these."""
-        return np.where(objects < self._around, objects + self._models, (objects - self._around) % self._models)
+        return np.where(objects < self.around, objects + self._models, (objects - self.around) % self._models)
 
     def _list_pairs(self, count) -> list[list[tuple[str, str]]]:
         """Return the pairs of names that intersect at each of the configurations of the last launch."""
         pairs, names = np.concatenate(self.found), self._names()
         rows: list[set] = [set() for _ in range(count)]
-        places = (pairs[:, 0] - self._around) // self._models
+        places = (pairs[:, 0] - self.around) // self._models
         for place, (a, b) in zip(places.tolist(), np.sort(self._number(pairs)).tolist()):
             rows[place].add((names[a], names[b]))
         return [sorted(row) for row in rows]

@@ -8,7 +8,7 @@ import warp as wp
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.upload import struct_of, zeros_of
-from warp_abtree.interop.robot.surroundings import RobotBatch
+from warp_abtree.interop.robot.surroundings import make_batch
 from warp_abtree.kernels.intersect.broad_phase import PosedBounds, pose_box_kernel
 from warp_abtree.kernels.robot import answers, forward, link_pairs
 from warp_abtree.query.request import Buffers
@@ -20,7 +20,7 @@ PAIRS_GUESS = 2  # of a configuration and stage
 NO_PAIRS = np.zeros((0, 2), np.int32)
 
 
-def order_parts(robot, robots: RobotBatch) -> tuple[link_pairs.Parts, list[tuple[int, int]]]:
+def order_parts(robot, meets) -> tuple[link_pairs.Parts, list[tuple[int, int]]]:
     """Return parts with the entries of what is asked, those of the outermost first, and the stages of entries.
 
     A stage (first, end) are the entries of a part, asked at once.
@@ -32,7 +32,7 @@ def order_parts(robot, robots: RobotBatch) -> tuple[link_pairs.Parts, list[tuple
     mounted = {whole_number(k, "mounted", 0, len(robot.link_names) - 1) for k in robot.mounted}
     for k in sorted(range(len(frame)), key=lambda k: -len(paths[k])):
         first = len(entries)
-        if robots.count and robot.model_link[k] not in mounted:
+        if len(meets) and robot.model_link[k] not in mounted:
             entries.append((k, -1, -1))
         for i, j in pairs[pairs[:, 1] == k].tolist():
             entries.append((j, i, max(set(paths[i]) & set(paths[j]), default=-1)))
@@ -44,7 +44,7 @@ def order_parts(robot, robots: RobotBatch) -> tuple[link_pairs.Parts, list[tuple
         link_pairs.Parts,
         robot.device,
         **dict(zip(("first", "second", "shared"), np.array(entries, np.int32).reshape(-1, 3).T)),
-        meets=robots.meets.astype(np.uint8),
+        meets=meets.astype(np.uint8),
         frame=frame,
         depth=[len(path) for path in paths],
         middle=middles,
@@ -61,6 +61,7 @@ class LinkQuery(DeviceMemory):
     graph captures it.
 
     Attributes:
+        around: Objects of the surroundings, which come first in the batch.
         active: Configurations that are posed, the room by default.
         demand: Pairs of a stage at most, and face pairs that waited, device int32 (2,).
         found: Of "pairs", pairs of objects that intersect, a part first, an array (k, 2) a stage.
@@ -69,10 +70,11 @@ class LinkQuery(DeviceMemory):
 
     def __init__(self, robot, around, output: str, room: int):
         self.device, self.output, self.room, self.active = robot.device, output, room, room
-        self.robots = RobotBatch(around, robot.models, room, robot.device)
+        self.batch, meets = make_batch(around, robot.models, room, robot.device)
+        self.around = len(meets)
         self.chain = robot.description.make_chain(self.device)
-        self.parts, self.stages = order_parts(robot, self.robots)
-        device, batch, rows = self.device, self.robots.batch, (room, len(self.chain.lower))
+        self.parts, self.stages = order_parts(robot, meets)
+        device, batch, rows = self.device, self.batch, (room, len(self.chain.lower))
         buffers, is_within = Buffers(pairs=max(1, PAIRS_GUESS * room)), output == "within"
         self.found, self.most, self.nearest = [], np.inf, None
         modes = {"distance": link_pairs.ASK_DISTANCE, "within": link_pairs.ASK_WITHIN}
@@ -93,7 +95,7 @@ class LinkQuery(DeviceMemory):
         self.chunk.count.fill_(room)
         self.hit, self.configurations = self.chunk.hit, wp.zeros(rows, dtype=wp.float64, device=device)
         self.demand = wp.zeros(2, dtype=wp.int32, device=device)
-        self._boxes, self._bounds, count = link_pairs.LinkBoxes(), PosedBounds(), self.robots.count
+        self._boxes, self._bounds, count = link_pairs.LinkBoxes(), PosedBounds(), self.around
         for name in ("lower", "upper"):
             corners = wp.zeros(batch.object_count, dtype=wp.vec3, device=device)
             setattr(self._boxes, name, corners)
@@ -104,7 +106,7 @@ class LinkQuery(DeviceMemory):
 
     def place(self):
         """Pose the parts of all configurations, and box all objects. Launches only."""
-        device, batch, around, parts = self.device, self.robots.batch, self.robots.count, self.parts.frame
+        device, batch, around, parts = self.device, self.batch, self.around, self.parts.frame
         inputs = [self.chain, self.configurations, self.frames]
         wp.launch(forward.forward_kernel, self.active, inputs, device=device)
         inputs = [around, parts, self.frames, batch.objects.pool]
@@ -118,7 +120,7 @@ class LinkQuery(DeviceMemory):
 
     def launch(self):
         """Check all configurations. Launches only."""
-        query, around = self.query, self.robots.count
+        query, around = self.query, self.around
         query.check_scene()
         with query.guard.launching(self):
             self._forget()

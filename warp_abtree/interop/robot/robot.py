@@ -376,7 +376,7 @@ class Robot:
         rooms = ROOMS["cpu" if self.device.is_cpu else "cuda"]
         room = next((room for room in rooms if room >= count), rooms[-1])
         query = self._kept.pop((key, output, room), None)
-        if query is None or not query.robots.is_of(around):
+        if query is None or not query.is_of(around):
             query = RobotQuery(self, around, output, room)
         self._kept[key, output, room] = query
         for old in list(self._kept)[:-KEPT]:
