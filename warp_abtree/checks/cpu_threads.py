@@ -60,29 +60,18 @@ class _Share:
 
     def close(self):
         """Wait until no thread touches the arrays of the launch any more, whatever interrupts that; raise it then."""
-
-        def settle():
-            with self._changed:
-                self._is_open = False
-                while self._running:
-                    self._changed.wait()
-
-        try:
-            _outlast(lambda: self._is_open or self._running, settle)
-        finally:
-            self._launch = None  # a busy thread that comes later must not keep its arrays until then
-
-
-def _outlast(goes_on, wait_once):
-    """Wait while something goes on, whatever interrupts that; raise it then."""
-    interruption = None
-    while goes_on():
-        try:
-            wait_once()
-        except BaseException as error:
-            interruption = error
-    if interruption is not None:
-        raise interruption
+        interruption = None
+        while self._is_open or self._running:
+            try:
+                with self._changed:
+                    self._is_open = False
+                    while self._running:
+                        self._changed.wait()
+            except BaseException as error:
+                interruption = error
+        self._launch = None  # a busy thread that comes later must not keep its arrays until then
+        if interruption is not None:
+            raise interruption
 
 
 def launch_on_cores(launch, cores):
@@ -110,4 +99,11 @@ def launch_on_cores(launch, cores):
 
 def wait_for(jobs):
     """Wait until no thread touches the arrays of jobs any more, whatever interrupts that; raise it then."""
-    _outlast(lambda: not all(job.done() for job in jobs), lambda: wait(jobs))
+    interruption = None
+    while not all(job.done() for job in jobs):
+        try:
+            wait(jobs)
+        except BaseException as error:
+            interruption = error
+    if interruption is not None:
+        raise interruption

@@ -95,8 +95,8 @@ class PlacedShapes:
             self.scene.set_poses(np.array(self.poses[: self.scene.object_count]))
             self._moved = False
 
-    def boxes(self):
-        """Return centres and half extents of all boxes in the world, (n, 3) each, rounded outwards."""
+    def gaps(self, pairs):
+        """Return a lower bound on the distance of each pair, that of their boxes, rounded outwards, (p,)."""
         poses = np.array(self.poses[: len(self.shapes)]).reshape(-1, 4, 4)
         middle, half = np.array([(shape.middle, shape.half) for shape in self.shapes]).reshape(-1, 2, 3).swapaxes(0, 1)
         rotation, position = poses[:, :3, :3], poses[:, :3, 3]
@@ -106,11 +106,7 @@ class PlacedShapes:
         pad = 3 * skew * size + 1e-12 * (size + np.abs(position).max(1, initial=0))
         middle = np.einsum("nij,nj->ni", rotation, middle) + position
         half = np.einsum("nij,nj->ni", np.abs(rotation), half)
-        return middle, half * (1 + 1e-9) + pad[:, None]
-
-    def gaps(self, pairs):
-        """Return a lower bound on the distance of each pair, that of their boxes, (p,)."""
-        middle, half = self.boxes()
+        half = half * (1 + 1e-9) + pad[:, None]
         i, j = pairs.T
         return np.linalg.norm(np.maximum(np.abs(middle[i] - middle[j]) - half[i] - half[j], 0), axis=1)
 
