@@ -39,18 +39,14 @@ class Playback:
         self.restart()
 
     def _begin(self) -> tuple:
-        """Return the `Frame` of a new start, its rigid bodies or None, and what chooses its LODs or None."""
-        raise NotImplementedError
-
-    def _poses_now(self) -> np.ndarray:
-        """Return the poses of all objects now, (n, 7)."""
+        """Begin anew: return the `Frame`, what chooses its LODs or None, rigid bodies or None, and poses by time."""
         raise NotImplementedError
 
     def restart(self):
         """Go back to the start, in the same mode."""
-        self._frame, self._bodies, self._own = self._begin()
+        self._frame, self._own, self._bodies, self._poses_at = self._begin()
         self.number, self.chosen, self._first = 0, self.scene.lods, self.scene.lods
-        self._poses = self._poses_now()
+        self._poses = self._poses_at(0.0)
         self.choose(self.mode, self._budget)
 
     @property
@@ -110,7 +106,7 @@ class Playback:
         result = self._frame.step()
         self.chosen, row = self.scene.lods, self._frame.history[-1]
         self.number = row.frame
-        self._poses = self._poses_now()
+        self._poses = self._poses_at(self.time)
         if self._bodies is not None:
             # The bodies have moved on: the result shown is of their poses now.
             result = self.scene.intersect(output=output)
@@ -128,10 +124,8 @@ class ScenePlayback(Playback):
     def _begin(self):
         bodies = self.loaded.make_bodies()
         frame = self.loaded.frame(bodies=bodies)
-        return frame, bodies, frame.lods
-
-    def _poses_now(self):
-        return self.loaded.motion.poses(self.time) if self._bodies is None else self._bodies.poses()
+        poses = self.loaded.motion.poses if bodies is None else lambda _: bodies.poses()
+        return frame, frame.lods, bodies, poses
 
 
 class StillPlayback(Playback):
@@ -151,10 +145,7 @@ class StillPlayback(Playback):
         self.scene.set_lods(self.started)
         frame = Frame(self.scene, None, self._sweep, "count", self.time_step)
         frame.warm_up()
-        return frame, None, self._sweep
-
-    def _poses_now(self):
-        return self._held
+        return frame, self._sweep, None, lambda _: self._held
 
 
 class MeshPlayback(StillPlayback):

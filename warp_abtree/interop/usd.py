@@ -141,7 +141,10 @@ def _make_shape(prim, time):
 
     kind = prim.GetTypeName()
     if kind == "Plane":
-        return _make_plane(get("width") / 2, get("length") / 2, get("axis"))
+        x, y = get("width") / 2 * np.array([-1, 1, 1, -1]), get("length") / 2 * np.array([-1, -1, 1, 1])
+        flat = np.zeros(4)
+        corners = {"X": [flat, y, -x], "Y": [x, flat, -y], "Z": [x, y, flat]}[get("axis")]
+        return np.stack(corners, 1), np.array([[0, 1, 2], [0, 2, 3]])
     makers = {
         "Cube": lambda: creation.box(extents=[get("size")] * 3),
         "Sphere": lambda: creation.icosphere(subdivisions=SUBDIVISIONS, radius=get("radius")),
@@ -156,11 +159,3 @@ def _make_shape(prim, time):
     # Of USD all have their middle at the origin.
     vertices = vertices - (vertices.min(0) + vertices.max(0)) / 2
     return vertices[:, AXIS_COLUMNS[get("axis") if prim.HasAttribute("axis") else "Z"]], np.asarray(mesh.faces)
-
-
-def _make_plane(width, length, axis):
-    """Return two triangles of half a width and half a length, whose normal is the axis."""
-    x, y = np.array([-width, width, width, -width]), np.array([-length, -length, length, length])
-    flat = np.zeros(4)
-    vertices = {"X": [flat, y, -x], "Y": [x, flat, -y], "Z": [x, y, flat]}[axis]
-    return np.stack(vertices, 1), np.array([[0, 1, 2], [0, 2, 3]])
