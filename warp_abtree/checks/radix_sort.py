@@ -10,7 +10,11 @@ import warp as wp
 def radix_sort(keys: wp.array, values: wp.array, count: int, bits: int):
     """Sort the first numbers of an array by so many low bits, and values with them, in place. Launches only.
 
-    Both have (2 count,) entries or more, the others scratch. Raises RuntimeError where Warp fails twice.
+    Args:
+        keys, values: (2 count,) or more; what lies behind the first count is scratch.
+
+    Raises:
+        RuntimeError: Warp did not sort them, twice.
     """
     for _ in range(2):
         ctypes.memset(_error_address(), 0, 1)
