@@ -127,7 +127,7 @@ def _sort(points, rows) -> wp.array:
     lower = np.array([column.min() for column in points.T])
     cell = max(column.max() - low for column, low in zip(points.T, lower)) / 2 ** int(kernels.CODE_BITS)
     code, order = (wp.empty(2 * len(points), dtype=wp.int32, device=rows.device) for _ in range(2))
-    inputs = [wp.vec3d(lower), wp.float64(float(cell) or 1.0), rows, code, order]
+    inputs = [wp.vec3d(*lower), wp.float64(float(cell) or 1.0), rows, code, order]
     wp.launch(kernels.code_point_kernel, len(points), inputs, device=rows.device)
     radix_sort(code, order, len(points), 32)
     return order
