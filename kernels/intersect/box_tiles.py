@@ -211,7 +211,8 @@ def list_tile_pair_kernel(
     end = count_before(i, boxes_inout)
     row, size = tiles.place[i] % warp_size(), warp_size()
     tile = tiles.place[i] / size
-    first, last = wp.int32(tiles.task[tile]), tiles.task[tile + 1]
+    first = wp.int32(tiles.task[tile])
+    last = tiles.task[tile + 1]
     while own > 0 and first < last:
         word = wp.int32(0)
         if first + lane < last:

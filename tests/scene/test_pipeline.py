@@ -179,7 +179,7 @@ def test_launches_of_a_frame(device, monkeypatch, name, levels, update_path):
     for count in (2, 40):
         scene = add_objects(device, [name] * count)
         large = sum(count << level > 1024 for level in range(levels))  # nodes of all states on a level
-        states = 3 if testing.current_regime().block_updates else 6 + large
+        states = 1 if testing.current_regime().block_updates else 6 + large
         for options, own in (({}, states), ({"ladder": [[0, 1]]}, 1)):
             for asked, broad in (({}, 2), ({"pairs": [(0, 1)], "within": 1.0}, 2 if cuda else 1)):
                 frame = ab.Pipeline(scene, "count", **asked, **options)

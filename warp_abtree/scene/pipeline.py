@@ -64,7 +64,7 @@ class Pipeline(DeviceMemory):
     states there are and how deep their trees (at most 31 levels):
 
     * 1 for poses;
-    * 3 for LODs; 4 more where there are trees that no block of threads takes (on CUDA from 4,096 faces on, or as many
+    * 1 for LODs; 6 more where there are trees that no block of threads takes (on CUDA from 8,192 faces on, or as many
       times more as there are more states than multiprocessors; from 65,536 on always), and then 1 for each level on
       which their states together have more than 1,024 nodes; 1 with a ladder;
     * 2 for the broad phase, on CUDA 4 more and a sort where a world has many hundreds of objects; none for given pairs;

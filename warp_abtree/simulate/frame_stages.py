@@ -12,7 +12,6 @@ from warp_abtree.checks.upload import Upload
 from warp_abtree.kernels.lod import frame_summary
 from warp_abtree.kernels.lod.ladder import WARP
 from warp_abtree.kernels.update import levels as level_kernels
-from warp_abtree.kernels.update import work_lists
 from warp_abtree.lod.controllers import Controller
 from warp_abtree.query.readout import waiting_demand
 from warp_abtree.query.stages.contacts import ContactQuery
@@ -111,8 +110,10 @@ class FrameStages:
         """Load the kernels that no other operator has loaded, and make room for what is found; nothing moves."""
         if self._stepped is not None:
             self._stepped.warm_up(self._time_step)
-        for module in (frame_summary, level_kernels, work_lists):
+        for module in (frame_summary, level_kernels):
             wp.load_module(module, self.device)
+        if self._levels is not None:
+            self._levels.load()
         self.grow()
 
     def arrays(self) -> tuple:

@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import LEVEL_MAX
+from warp_abtree.kernels.update import block_update, work_lists
 from warp_abtree.kernels.update import levels as level_kernels
-from warp_abtree.kernels.update import work_lists
 from warp_abtree.state.arrays import ModelArrays, StateArrays
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.work_lists import (
@@ -93,8 +93,8 @@ class DeviceLodUpdate(WorkLists):
         )
 
     def launch(self):
-        """Refine meshes and update trees. Launches only: three, and where there are trees that no block takes four more
-        and one for each level that has much to refit.
+        """Refine meshes and update trees. Launches only: one, where there are trees that no block takes six more, and
+        one for each level that has much to refit.
 
         Where it is interrupted, the next launch refits every state whole.
         """
@@ -108,6 +108,11 @@ class DeviceLodUpdate(WorkLists):
 
     def _launch(self):
         count = len(self.wanted)
+        if self.entry_room + self.face_room == 0:
+            inputs = [self.models.pool, self._scratch, self.states.pool, self.plan]
+            inputs += [self.splits, self.wanted, self.faults]
+            self.launch_blocks(block_update.wanted_update, count, inputs)
+            return
         wp.launch(work_lists.clear_plan_kernel, max(count, int(LEVEL_MAX)), [self.plan], device=self.device)
         inputs = [self.models.pool, self.splits, self.wanted, self.states.pool, self.plan, self.faults]
         wp.launch(work_lists.plan_update_kernel, count, inputs, device=self.device)
@@ -203,6 +208,11 @@ class LevelStates:
             if self.batch.follows(self):
                 self.batch.tear()
             raise
+
+    def load(self):
+        """Load the kernels that update states, by launching them while every state is at its LOD."""
+        if self._update is not None:
+            self._update.launch()
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
         """Return LOD and tree state of every object as the last launch has left them. Waits for the device."""
