@@ -313,17 +313,17 @@ def wanted_update(shallow: bool):
         threads: wp.int32,
         models: ModelPool,
         scratch: wp.array(dtype=wp.uint32),
-        states_inout: StatePool,
-        plan_out: UpdateLists,
         splits: SplitTable,
         wanted: wp.array(dtype=wp.int32),
+        states_inout: StatePool,
         faults_inout: wp.array(dtype=wp.int32),
+        plan_out: UpdateLists,
     ):
         """Bring one state after another to its LOD, a block each, where a block takes all of them.
 
         Args:
-            plan_out: Its counts of each state; nothing is listed.
             wanted, faults_inout: As for `plan_update_kernel`.
+            plan_out: Its counts of each state; nothing is listed.
         """
         block, thread = wp.tid()
         state = wp.int32(block)
