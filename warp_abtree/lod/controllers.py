@@ -85,7 +85,7 @@ class Controller(DeviceMemory):
             raise TypeError(f"camera is a {type(camera).__name__}, neither a Camera nor a function of time")
         self.scene, self.camera, self.ladder, self.device = scene, camera, ladder, scene.device
         self.view, self.pool = View(scene, window), lod_pool(ladder, scene)
-        self._ahead: tuple = (math.nan, None)  # a time, and the camera then
+        self._ahead = math.nan  # time of a camera that was brought for the next `prepare`
         self.lods, self.chosen = self._zeros(scene.object_count, wp.int32), prediction.LevelChoice()
 
     def next_lods(self, feedback: Feedback) -> wp.array:
@@ -118,16 +118,17 @@ class Controller(DeviceMemory):
             RuntimeError: As `next_lods`.
         """
         self.view.check()
-        if self._ahead[0] != feedback.time:
+        if self._ahead != feedback.time:
             self.look_ahead(feedback.time)
-        if self.camera is not None:
-            self.view.look(self._ahead[1])
+        self._ahead = math.nan
         if not rests:
             self._update(feedback)
 
     def look_ahead(self, time: float):
-        """Find the camera of the next `prepare`, as while the device works on a frame."""
-        self._ahead = time, self.camera(time) if callable(self.camera) else self.camera
+        """Bring the camera of the next `prepare` to the device, behind what was launched."""
+        if self.camera is not None:
+            self.view.look(self.camera(time) if callable(self.camera) else self.camera)
+        self._ahead = time
 
     def launch(self, rests: bool = False):
         """Measure the view as the camera and the objects stand, and select the LODs of a frame. Launches only.

@@ -57,7 +57,7 @@ class FrameStages:
         self._stepped = motion if isinstance(motion, SteppedMotion) else None
         self.answer, self._find_poses = getattr(motion, "answer", None), getattr(motion, "poses", None)
         self._memory = np.empty((scene.object_count, 7))
-        self._ahead: tuple = (None, None)  # a time, and the poses then
+        self._ahead: tuple = (None, False)  # a time, and whether poses of it were brought
         self._dynamics = None if self._stepped is None else self._stepped.dynamics
         if self._dynamics is None:
             contacts = output == "contacts"
@@ -121,33 +121,32 @@ class FrameStages:
 
     def bring_poses(self, time: float) -> bool:
         """Bring to the device the poses of a frame that begins at a time [s]; return whether there are any to set."""
-        known, poses = self._ahead
-        self._ahead = None, None
+        known, places = self._ahead
+        self._ahead = None, False
         if known != time:
-            poses = self._poses(time)
+            places = self._send_poses(time)
         if self._stepped is not None:
             self._stepped.aim(time + self._time_step)
-        if poses is not None:
-            self._upload.send(poses.ravel())
-        return poses is not None
+        return places
 
-    def _poses(self, time):
-        """Return checked poses of a time; None if there are none, or the motion has set those of the scene."""
+    def _send_poses(self, time) -> bool:
+        """Bring checked poses of a time to the device; false if there are none, or the motion has set the scene's."""
         poses = None if self._find_poses is None else self._find_poses(time, out=self._memory)
         if poses is None:
-            return None
+            return False
         rows = check_poses(poses, removed=self.scene.batch().removed)
         if rows.shape != self._memory.shape:
             raise ValueError(f"motion: poses of shape {rows.shape}, not {self._memory.shape}")
-        return rows
+        self._upload.send(rows.ravel())
+        return True
 
     def look_ahead(self, time: float):
-        """Do what the host can of a frame that begins at a time to come, as while the device works on this one."""
+        """Do what the host can of a frame that begins at a time to come, behind the launches of this one."""
         if self.controller is not None:
             with suppress(Exception):  # a camera that there is none of raises when its frame comes
                 self.controller.look_ahead(time)
         if isinstance(self.motion, Kinematic):
-            self._ahead = time, self._poses(time)
+            self._ahead = time, self._send_poses(time)
 
     def select(self, rests: bool):
         """Select LODs, if there is a controller, unless all are known to stay after a frame in which they did."""
