@@ -83,11 +83,12 @@ def summarise_frame_kernel(
     if i < level_count.shape[0]:
         summary_out[HEAD + i] = wp.int64(level_count[i])
     if ends_launch(ended_inout, threads):
+        frames = sums_inout[wp.static(FRAMES)] + wp.int64(1)
         for k in range(HEAD):
             summary_out[k] = sums_inout[k]
             sums_inout[k] = wp.int64(0)
-        sums_inout[wp.static(FRAMES)] = summary_out[wp.static(FRAMES)] + wp.int64(1)
-        summary_out[wp.static(FRAMES)] = sums_inout[wp.static(FRAMES)]
+        sums_inout[wp.static(FRAMES)] = frames
+        summary_out[wp.static(FRAMES)] = frames
         summary_out[wp.static(LAUNCHED)] = wp.int64(batch.launched[0])
         summary_out[wp.static(PAIRS)] = wp.int64(batch.count[0])
         summary_out[wp.static(APART)] = read_total(hits.apart_total)
