@@ -21,9 +21,8 @@ from warp_abtree.query.request import check_within
 from warp_abtree.scene.objects import check_models
 from warp_abtree.scene.posed_objects import PosedObjects
 
-# Points of a thread, of which the next starts from the last one's nearest face; and of each launch the places between
-# points, which lead those behind them in the next one.
-RUNS = {"cpu": (256, (1,)), "cuda": (1, (1024, 32, 1))}
+# Points of a thread: the next starts from the last one's nearest face.
+RUNS = {"cpu": 256, "cuda": 1}
 # Models whose device arrays are kept for the next call.
 KEPT_MODELS = 4
 TOO_FAR = "has a coordinate beyond 2^300, the most that a mesh may have"
@@ -97,13 +96,10 @@ def _measure(scene, asked, points, within, names) -> tuple:
         setattr(found, name, wp.empty(n, dtype=dtype, device=device))
     if n:
         rows = wp.array(points, dtype=wp.vec3d, device=device)
+        run = RUNS["cpu" if device.is_cpu else "cuda"]
         asked = wp.array(np.asarray(asked, np.int32), dtype=wp.vec2i, device=device)
-        inputs = [wp.float64(most), batch.trees, asked, rows, _sort(points, rows), found]
-        (run, steps), leader_step = RUNS["cpu" if device.is_cpu else "cuda"], 0
-        for step in steps:
-            given = [run, step, leader_step, *inputs]
-            wp.launch(kernels.measure_point_kernel, -(-n // (run * step)), given, device=device, block_dim=64)
-            leader_step = step
+        inputs = [run, wp.float64(most), batch.trees, asked, rows, _sort(points, rows), found]
+        wp.launch(kernels.measure_point_kernel, -(-n // run), inputs, device=device, block_dim=64)
     return tuple(getattr(found, name).numpy() for name in names)
 
 
