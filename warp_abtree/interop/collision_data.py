@@ -24,18 +24,22 @@ class ContactData(PairData):
         names: Names of the two objects, a set.
         point: Midpoint of the segment [world units], float64 (3,).
         normal: Unit normal from the first object of the pair to the second, float64 (3,).
-        depth: How far the deepest point of one object inside the other, a solid, is from the surface; of surfaces, how
-            deep the two faces are in one another [world units].
+        depth: Penetration depth of the two objects, that of `Scene.penetration` [world units]: as far as `way_out`.
         segment: End points of the segment in which the two faces intersect; where one object is wholly inside the
-            other, that deepest point and the surface's nearest one [world units], float64 (2, 3).
+            other, its deepest point and the surface's nearest one [world units], float64 (2, 3).
     """
 
-    __slots__ = ("depth", "normal", "point", "segment")
+    __slots__ = ("_ways", "depth", "normal", "point", "segment")
 
-    def __init__(self, names, faces, segment, normal, depth):
+    def __init__(self, names, faces, segment, normal, depth, way):
         super().__init__(names, faces)
         self.segment, self.normal, self.depth = segment, normal, depth
         self.point = 0.5 * (segment[0] + segment[1])
+        self._ways = dict(zip(names, (-way, way)))
+
+    def way_out(self, name) -> np.ndarray:
+        """Return the translation that frees the named object from the other one [world units], float64 (3,)."""
+        return self._ways[name]
 
 
 class DistanceData(PairData):

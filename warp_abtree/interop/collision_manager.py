@@ -12,6 +12,7 @@ from warp_abtree.interop.placed_shapes import PlacedShapes, shape_of
 from warp_abtree.state.poses import check_poses
 
 EXTERNAL = "__external"  # trimesh's name for a mesh that is not in the manager
+DEPTH_TOLERANCE = 2.0**-40  # of `Scene.penetration`
 FIRST_PAIRS = 64  # tested first if one collision is enough
 
 
@@ -32,12 +33,12 @@ class CollisionManager(DeviceMemory):
     * Answers are exact for the given poses (FCL rounds those of `add_object` to float32 and tests convex meshes
       iteratively). Touching is a collision. What lies inside any closed mesh collides with it, not only inside a convex
       one.
-    * A contact is a pair of intersecting faces with their indices, also of convex meshes. Its depth is that of the pair
-      of objects if one is a solid that holds points of the other: how far the deepest of these is from the surface
-      (`query.stages.distance`); else how deep the two faces are in one another. An object wholly inside a solid
-      gives one contact, whose segment joins that deepest point and the surface.
-    * Distances [world units] are negative where solids are deep in one another, by that depth, a lower bound of the
-      penetration depth; 0 where surfaces merely intersect, infinite if there are no objects. They are exact to the
+    * A contact is a pair of intersecting faces with their indices, also of convex meshes. Its depth is the penetration
+      depth of the two objects, whatever their shapes: the least certified way out of `Scene.penetration`, the same in
+      all contacts of a pair. An object wholly inside a solid gives one contact, whose segment joins its deepest point
+      and the surface.
+    * Distances [world units] are negative where solids are deep in one another, by how far the deepest point of one is
+      from the surface of the other (`query.stages.distance`), a lower bound of the penetration depth; 0 where surfaces merely intersect, infinite if there are no objects. They are exact to the
       rounding of coordinates, for convex meshes too.
     * Transforms must be rigid within 1e-6; an object of the same name is replaced; `add_object` returns nothing.
 
@@ -257,25 +258,24 @@ class CollisionManager(DeviceMemory):
         if not return_data:
             hit = np.flatnonzero(scene.intersect(pairs, output="any").any)
             return bool(len(hit)), [names[k] for k in hit.tolist()], []
-        result = scene.intersect(pairs, output="contacts", gap=0.0)
+        result = scene.intersect(pairs, output="contacts")
         hit = np.flatnonzero(result.any)
-        deep = scene.intersect(pairs[hit], "distance", signed=scene.batch().has_solid(pairs[hit]))
-        depth = np.zeros(len(pairs))
-        depth[hit] = -deep.distance
+        found = scene.penetration(pairs[hit], tolerance=DEPTH_TOLERANCE)
+        ways = {k: found.depth[row] * found.direction[row] for row, k in enumerate(hit.tolist())}
+        depths = dict(zip(hit.tolist(), found.depth.tolist()))
         rows = result.contacts
-        own = depth[rows["pair"]]
-        depths = np.where(own > 0, own, np.maximum(-rows["separation"], 0)).tolist()
         segments = np.stack([rows["p0"], rows["p1"]], 1)
         contacts = [
-            ContactData(names[k], *of)
-            for k, *of in zip(rows["pair"].tolist(), rows["faces"].tolist(), segments, rows["normal"], depths)
+            ContactData(names[k], *of, depths[k], ways[k])
+            for k, *of in zip(rows["pair"].tolist(), rows["faces"].tolist(), segments, rows["normal"])
         ]
-        for row in np.flatnonzero(result.count[hit] == 0).tolist():
+        nested = hit[result.count[hit] == 0]
+        deep = scene.intersect(pairs[nested], "distance", signed=True) if len(nested) else None
+        for row, k in enumerate(nested.tolist()):
             points, deepest = deep.points[row], -deep.distance[row]
-            # Whichever of the two is inside, it is the way out of the second object.
-            normal = (points[0] - points[1]) / deepest
-            faces = deep.point_faces[row].tolist()
-            contacts.append(ContactData(names[hit[row]], faces, points, normal, float(deepest)))
+            # Whichever of the two is inside, it points as the second object leaves.
+            normal, faces = (points[0] - points[1]) / deepest, deep.point_faces[row].tolist()
+            contacts.append(ContactData(names[k], faces, points, normal, depths[k], ways[k]))
         return bool(len(hit)), [names[k] for k in hit.tolist()], contacts
 
     def _nearest(self, pairs, names):
