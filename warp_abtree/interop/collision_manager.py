@@ -2,6 +2,7 @@
 
 import math
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 
@@ -38,8 +39,9 @@ class CollisionManager(DeviceMemory):
       all contacts of a pair. An object wholly inside a solid gives one contact, whose segment joins its deepest point
       and the surface.
     * Distances [world units] are negative where solids are deep in one another, by how far the deepest point of one is
-      from the surface of the other (`query.stages.distance`), a lower bound of the penetration depth; 0 where surfaces merely intersect, infinite if there are no objects. They are exact to the
-      rounding of coordinates, for convex meshes too.
+      from the surface of the other (`query.stages.distance`), a lower bound of the penetration depth; 0 where surfaces
+      merely intersect, infinite if there are no objects. They are exact to the rounding of coordinates, for convex
+      meshes too.
     * Transforms must be rigid within 1e-6; an object of the same name is replaced; `add_object` returns nothing.
 
     Cost: meshes are prepared once for all managers, by content. The first call after `add_object` of a mesh without a
@@ -265,12 +267,10 @@ class CollisionManager(DeviceMemory):
         depths = dict(zip(hit.tolist(), found.depth.tolist()))
         rows = result.contacts
         segments = np.stack([rows["p0"], rows["p1"]], 1)
-        contacts = [
-            ContactData(names[k], *of, depths[k], ways[k])
-            for k, *of in zip(rows["pair"].tolist(), rows["faces"].tolist(), segments, rows["normal"])
-        ]
+        listed = zip(rows["pair"].tolist(), rows["faces"].tolist(), segments, rows["normal"])
+        contacts = [ContactData(names[k], f, segment, n, depths[k], ways[k]) for k, f, segment, n in listed]
         nested = hit[result.count[hit] == 0]
-        deep = scene.intersect(pairs[nested], "distance", signed=True) if len(nested) else None
+        deep: Any = scene.intersect(pairs[nested], "distance", signed=True) if len(nested) else None
         for row, k in enumerate(nested.tolist()):
             points, deepest = deep.points[row], -deep.distance[row]
             # Whichever of the two is inside, it points as the second object leaves.

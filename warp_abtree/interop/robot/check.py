@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import whole_number
+from warp_abtree.checks.arguments import finite_array, whole_number
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.upload import struct_of
 from warp_abtree.interop.robot.link_query import LinkDistances, LinkHits, LinkPairs, LinkRequest
@@ -25,6 +25,23 @@ EDGES_AT_ONCE = 1024
 STRETCHES_MAX, WIDTH_LEAST = 1024, 2.0**-30
 
 
+def padding_of(robot) -> np.ndarray:
+    """Return the padding of each model of a robot, float64 (m,).
+
+    Raises:
+        TypeError, ValueError: `link_padding` is no dict, names no link, or has a value that is no finite distance.
+    """
+    given = robot.link_padding
+    if not isinstance(given, dict):
+        raise TypeError(f"link_padding: a {type(given).__name__} is no dict of distances by the names of links")
+    for name, value in given.items():
+        if name not in robot.link_names:
+            raise ValueError(f"link_padding: the robot has no link {name!r}")
+        if finite_array(value, f"link_padding of {name!r}", ()) < 0:
+            raise ValueError(f"link_padding of {name!r}: {value} is below 0")
+    return np.array([float(given.get(robot.link_names[k], 0.0)) for k in robot.model_link])
+
+
 def make_link_request(robot, robots: RobotBatch, room: int) -> LinkRequest:
     """Return the `LinkRequest` of a chunk, with parts asked from the outermost inwards."""
     description, device = robot.description, robot.device
@@ -41,6 +58,7 @@ def make_link_request(robot, robots: RobotBatch, room: int) -> LinkRequest:
             entries.append((j, i, max(set(paths[i]) & set(paths[j]), default=-1)))
         if len(entries) > first:
             stages.append((first, len(entries)))
+    padding = padding_of(robot)
     middles = [model.centre for model in robot.models]
     vertices = [model.progressive.vertex_pos[: model.progressive.vertex_count] for model in robot.models]
     columns = np.array(entries, np.int32).reshape(-1, 3).T
@@ -52,10 +70,13 @@ def make_link_request(robot, robots: RobotBatch, room: int) -> LinkRequest:
         frame=frame,
         depth=[len(path) for path in paths],
         middle=middles,
+        padding=padding * (1 + 2.0**-50),
         radius=[np.sqrt(((v - m) ** 2).sum(1).max()) * (1 + 2.0**-40) for v, m in zip(vertices, middles)],
     )
     # A launch is one even where there is nothing to ask.
-    return LinkRequest(description.make_chain(device), parts, stages or [(0, 0)], robots.count, room)
+    return LinkRequest(
+        description.make_chain(device), parts, stages or [(0, 0)], robots.count, room, bool(padding.any())
+    )
 
 
 class RobotQuery(DeviceMemory):

@@ -1,6 +1,7 @@
 """Queries about the parts of a robot at a chunk of configurations, among themselves and with what surrounds them."""
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.intersect.broad_phase import PosedBounds, pose_box_kernel
 from warp_abtree.kernels.robot import answers, forward, link_pairs
+from warp_abtree.kernels.robot.link_pairs import ASK_ANY, ASK_DISTANCE, ASK_PADDED, ASK_WITHIN
 from warp_abtree.query.request import Buffers
 from warp_abtree.query.stages.distance import DistanceQuery
 from warp_abtree.query.stages.intersect import Query
@@ -27,6 +29,7 @@ class LinkRequest:
     stages: list[tuple[int, int]]  # (first, end) of the entries of `parts` that are asked one after the other
     around: int  # objects of the surroundings, which come first
     room: int  # configurations
+    is_padded: bool = False  # whether a part has padding
 
 
 class LinkQuery(DeviceMemory):
@@ -37,7 +40,7 @@ class LinkQuery(DeviceMemory):
     Args:
         query: `Query` or `DistanceQuery` of the batch, without pairs.
         request: `LinkRequest`.
-        mode: Of `link_pairs`, what is asked.
+        modes: Of `link_pairs`, what is asked of each stage, one after the other.
         distances: Up to where each pair matters, device float64 (pair,); None where that is 0.
 
     Attributes:
@@ -50,14 +53,14 @@ class LinkQuery(DeviceMemory):
 
     nearest: Any = None  # `answers.NearestParts`, where distances are asked
 
-    def __init__(self, query, request: LinkRequest, mode: int, distances: str | None = None):
-        self.query, self.request, self.mode, self.active = query, request, mode, request.room
+    def __init__(self, query, request: LinkRequest, modes: tuple, distances: str | None = None):
+        self.query, self.request, self.modes, self.active = query, request, modes, request.room
         self.batch, self.device, self._distances, batch = query.batch, query.device, distances, query.batch
         device, room = batch.device, request.room
         rows = room, len(request.chain.lower)
         self.frames = zeros_of(forward.Frames, room, len(request.chain.parent), device)
-        spread, within = (rows, room) if mode == link_pairs.ASK_WITHIN else ((0, 0), 0)
-        most = room if mode == link_pairs.ASK_DISTANCE else 0
+        spread, within = (rows, room) if ASK_WITHIN in modes else ((0, 0), 0)
+        most = room if ASK_DISTANCE in modes else 0
         self.chunk = link_pairs.Chunk()
         sizes: dict[str, Any] = dict(count=1, half=spread, size=spread, hit=room, near=within, best=most)
         for name, shape in sizes.items():
@@ -96,16 +99,16 @@ class LinkQuery(DeviceMemory):
         with query.guard.launching(self):
             self._begin()
             self.place()
-            for stage in self.request.stages:
+            for stage, mode in product(self.request.stages, self.modes):
                 query.pair_count.zero_()
-                self._find_pairs(stage)
+                self._find_pairs(stage, mode)
                 query.search()
-                self._note([self.request.around, len(self.request.parts.frame), query.pair_batch])
+                self._note([self.request.around, len(self.request.parts.frame), query.pair_batch], mode)
 
-    def _find_pairs(self, stage):
+    def _find_pairs(self, stage, mode: int):
         request, query = self.request, self.query
         distances = None if self._distances is None else query.distances_of(self._distances)
-        inputs = [self.mode, wp.vec2i(*stage), request.around, request.chain, request.parts, self.frames]
+        inputs = [mode, wp.vec2i(*stage), request.around, request.chain, request.parts, self.frames]
         inputs += [self.boxes, self.chunk, query.pair_batch, distances]
         wp.launch(link_pairs.find_link_pair_kernel, self.active, inputs, device=self.device)
 
@@ -113,7 +116,7 @@ class LinkQuery(DeviceMemory):
         """Forget the answers of the last launch. Launches only."""
         self.demand.zero_()
 
-    def _note(self, found: list):
+    def _note(self, found: list, mode: int):
         """Reduce the answers of a stage's pairs to those of configurations. Launches only."""
         raise NotImplementedError
 
@@ -130,16 +133,24 @@ class LinkQuery(DeviceMemory):
 
 
 class LinkHits(LinkQuery):
-    """Which configurations have parts that intersect; with proofs, also which have all proved apart by a reach."""
+    """Which configurations have parts that meet; with proofs, also which have all proved apart by a reach and paddings.
+
+    Parts that are padded meet where they are not proved apart by their paddings: that is asked first.
+    """
 
     def __init__(self, batch: Batch, request: LinkRequest, capacity: int, proves: bool):
-        query = Query(batch, "any", NO_PAIRS, Buffers(pairs=capacity), within=0.0 if proves else None)
-        mode = int(link_pairs.ASK_WITHIN if proves else link_pairs.ASK_ANY)
-        super().__init__(query, request, mode, "within" if proves else None)
+        asked = [(ASK_PADDED, request.is_padded), (ASK_WITHIN, proves), (ASK_ANY, not (request.is_padded or proves))]
+        modes = tuple(mode for mode, is_asked in asked if is_asked)
+        near = None if ASK_ANY in modes else "within"
+        query = Query(batch, "any", NO_PAIRS, Buffers(pairs=capacity), within=None if near is None else 0.0)
+        super().__init__(query, request, modes, near)
+        self._padded = link_pairs.Chunk()  # where what is near meets
+        for name in link_pairs.Chunk.vars:
+            setattr(self._padded, name, getattr(self.chunk, "hit" if name == "near" else name))
 
-    def _note(self, found):
-        query = self.query
-        inputs = [*found, query.hits, None if query.near is None else query.near.any_hit, self.chunk, self.demand]
+    def _note(self, found, mode):
+        query, chunk = self.query, self._padded if mode == ASK_PADDED else self.chunk
+        inputs = [*found, query.hits, None if query.near is None else query.near.any_hit, chunk, self.demand]
         wp.launch(answers.note_hit_kernel, len(query.pairs), inputs, device=self.device)
 
 
@@ -159,11 +170,13 @@ class LinkPairs(LinkHits):
         super()._begin()
         self.found = []
 
-    def _note(self, found):
-        super()._note(found)
+    def _note(self, found, mode):
+        super()._note(found, mode)
         self.chunk.hit.zero_()  # later stages are asked, too
         pairs = self.query.pairs.numpy()[: self.query.pair_count.numpy()[0]]
-        self.found.append(pairs[self.query.hits.any_hit.numpy()[: len(pairs)] != 0])
+        for hits in (self.query.hits, self.query.near):
+            if hits is not None:
+                self.found.append(pairs[hits.any_hit.numpy()[: len(pairs)] != 0])
 
 
 class LinkDistances(LinkQuery):
@@ -178,7 +191,7 @@ class LinkDistances(LinkQuery):
     def __init__(self, batch: Batch, request: LinkRequest, capacity: int):
         self.nearest = zeros_of(answers.NearestParts, request.room, 0, batch.device)
         query = DistanceQuery(batch, NO_PAIRS, Buffers(pairs=capacity))
-        super().__init__(query, request, int(link_pairs.ASK_DISTANCE), "beyond")
+        super().__init__(query, request, (ASK_DISTANCE,), "beyond")
 
     def _begin(self):
         super()._begin()
@@ -188,7 +201,7 @@ class LinkDistances(LinkQuery):
         self.nearest.faces.fill_(wp.vec2i(-1, -1))
         self.nearest.pair.fill_(wp.vec2i(-1, -1))
 
-    def _note(self, found):
+    def _note(self, found, mode):
         query = self.query
         self.nearest.winner.fill_(int(answers.NO_PAIR))
         for kernel, inputs in (
