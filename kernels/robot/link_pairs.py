@@ -8,7 +8,8 @@ middle, and so does its axis. A turn T takes a point p that outer joints have mo
     |T q - p| <= |T q - T p| + |T p - p| = |q - p| + |T p - p|
 
 and |T p - p| is at most the angle times the distance of p from the axis, both in the middle. So the reach of a part is
-the sum over its joints of angle times distance of its farthest point, or of how far a joint slides.
+the sum over its joints of angle times distance of its farthest point, or of how far a joint slides (docs/exactness.md,
+bound 22).
 
 The joints that both parts of a pair hang on move them as one and do not count.
 
