@@ -11,6 +11,7 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.io import results as kernels
+from warp_abtree.kernels.search.make_slabs import make_slab_kernel
 from warp_abtree.query.request import APART_FOR_UNCERTAIN
 from warp_abtree.query.result import COUNTERS, Found, Result, Totals
 from warp_abtree.query.sorting import HitSort, first_sort, sort_rows
@@ -27,11 +28,15 @@ def waiting_demand(operator: Any, apart: int, uncertain: int) -> int:
     return max(apart, uncertain * (APART_FOR_UNCERTAIN if operator.lists_apart else 1))
 
 
-def readout_kernels(device, output: str) -> list:
-    """Return the kernels of the first readout, see `loading`."""
-    if not current_regime().packs(device):
-        return []
-    return [(kernels.pack_pair_kernel, kernels.BLOCK_DIM), *(first_sort(device) if output == "faces" else [])]
+def operator_kernels(device, stages, output: str) -> list:
+    """Return the kernels of the first launch of an operator with these stages, as `loading` takes them."""
+    regime = current_regime()
+    found = [kernel for stage in stages for kernel in stage.kernels(device)]
+    if regime.uses_warps(device) and regime.slabs:
+        found.append((make_slab_kernel, 256))
+    if regime.packs(device):
+        found += [(kernels.pack_pair_kernel, kernels.BLOCK_DIM), *(first_sort(device) if output == "faces" else [])]
+    return found
 
 
 class HostViews:
@@ -114,24 +119,21 @@ class Readout:
             operator.guard.check(found.totals.launched)
         for read in operator.readers:
             read(found, device, with_rows)
-        return Result(found, operator.rooms, operator.output, operator.batch.names)
+        return Result(found, operator.list_rooms, operator.output, operator.batch.names)
 
     def read_totals(self) -> Totals:
         """Read what the last launch needed of each list. Waits for the device."""
         operator = self.operator
         if self.packs:
             return self._totals(self.staging.fetch_words(self._pack_pairs(0), HEADER))
-        views, hits, total, uncertain = self.views, operator.hits, 0, 0
-        if operator.output == "faces":
-            total = max(int(views.counts[0].sum()), self._read_count(hits.witness_total))
-        if operator.rooms.uncertain:
-            apart, waiting = self._read_count(hits.apart_total), int(views.counts[FLOAT64_ROW].sum())
-            uncertain = waiting_demand(operator, apart, waiting)
-        return Totals(operator.guard.outcome(), self._pair_count(int(views.pair_count[0])), total, uncertain)
+        views, hits = self.views, operator.hits
+        apart, witnesses = self._read_count(hits.apart_total), self._read_count(hits.witness_total)
+        lists = int(views.counts[0].sum()), int(views.counts[FLOAT64_ROW].sum()), apart, witnesses
+        return Totals(operator.guard.outcome(), self._pair_count(int(views.pair_count[0])), *self._demands(*lists))
 
     @staticmethod
     def _read_count(count) -> int:
-        """Return a counter of the CPU, read as uint32; 0 where there is none."""
+        """Return a counter, read as uint32; 0 where there is none. Waits for the device."""
         return 0 if count is None else int(count.numpy().view(np.uint32)[0])
 
     def _pair_count(self, found: int) -> int:
@@ -141,12 +143,17 @@ class Readout:
 
     def _totals(self, words) -> Totals:
         """Return the demands in a header; those of lists that the operator lacks are 0."""
-        launched, found, total, uncertain, apart, witnesses = words[:HEADER].tolist()
-        total = max(total, witnesses)
-        operator = self.operator
-        listed, waits = operator.output == "faces", operator.rooms.uncertain
+        launched, found, *lists = words[:HEADER].tolist()
+        return Totals(launched, self._pair_count(found), *self._demands(*lists))
+
+    def _demands(self, total: int, uncertain: int, apart: int, witnesses: int) -> tuple[int, int]:
+        """Return the room that the lists of hits, and of face pairs that wait, need; 0 for one that there is not."""
+        operator, hits = self.operator, self.operator.hits
+        if operator.parts is not None:  # the lists have held those of one part at a time
+            total, uncertain = self._read_count(hits.total), self._read_count(hits.uncertain_total)
+        listed, waits = operator.output == "faces", operator.list_rooms.uncertain
         demand = waiting_demand(operator, apart, uncertain) if waits else 0
-        return Totals(launched, self._pair_count(found), total if listed else 0, demand)
+        return max(total, witnesses) if listed else 0, demand
 
     def read_pairs(self, device: bool) -> Found:
         """Read demands, and what there is an entry a pair of. Waits for the device."""
