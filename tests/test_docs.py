@@ -122,6 +122,25 @@ def test_files_that_are_named_exist(page):
         assert (ROOT / name).exists() or name in ("warp_abtree/kernels", "warp_abtree/scenes"), name
 
 
+def test_bounds_are_numbered_once_and_cited():
+    """Every bound of the page on exactness has one number, in turn, and code cites each of them and no other."""
+    page = (ROOT / "docs" / "exactness.md").read_text(encoding="utf-8")
+    numbered = [int(number) for number in re.findall(r"\(bound (\d+)\)", page)]
+    assert numbered == list(range(1, 1 + len(numbered))) and len(numbered) > 20
+    cited = set()
+    for path in (*(ROOT / "kernels").rglob("*"), *(ROOT / "warp_abtree").rglob("*.py")):
+        if path.suffix in (".py", ".h", ".cuh"):
+            text = re.sub(r"\s+(?:#|//)?\s*", " ", path.read_text(encoding="utf-8"))
+            found = {
+                int(n)
+                for some in re.findall(r"exactness\.md, bounds? ([\d, and]+)", text)
+                for n in re.findall(r"\d+", some)
+            }
+            assert found <= set(numbered), f"{name_of(path)} cites bounds {sorted(found - set(numbered))}"
+            cited |= found
+    assert cited == set(numbered)
+
+
 def test_blocks_are_found_and_told_apart():
     found = BLOCK.findall("x\n<!-- needs: torch, cuda -->\n```python\na\n```\n\n```sh\nb\n```\n```python\nc\n```\n")
     assert found == [("torch, cuda", "python", "a\n"), ("", "sh", "b\n"), ("", "python", "c\n")]

@@ -1,4 +1,4 @@
-"""Gradients of signed distances of things that overlap in many worlds, beside differences of python-fcl's."""
+"""Gradients of signed distances of things that overlap in many worlds, beside differences of peers' distances."""
 
 import contextlib
 import io
@@ -11,6 +11,7 @@ import warp as wp
 
 import warp_abtree as ab
 
+from ..baselines.warp_mesh import WarpMeshSlopes
 from ..timing import medians, one_core, time_call, time_rounds
 
 SAMPLE = Path(__file__).parents[2] / "scenes" / "07_place_without_overlap.py"
@@ -18,15 +19,16 @@ WORLDS = 64
 
 
 def run(device, quick=False):
-    """Yield a row: `DistanceQuery.run` with its gradients on the host, and python-fcl's distances with differences.
+    """Yield a row: `DistanceQuery.run` with its gradients on the host, and peers' distances with differences.
 
-    One core each, timed by what its thread ran, but for a GPU.
+    One core each, timed by what its thread ran, but for a GPU. Peers are python-fcl, and Warp's own mesh queries, on
+    the device.
 
-    Meshes, placement and margin are those of the sample at its start. FCL is asked seven times where a pair is nearer
-    than the margin, else once. Columns: overlapping are pairs that intersect, near those nearer than the margin;
-    ratio is FCL's time over that here. differ counts, of the pairs that are apart, those whose distance is off by more
-    than 1e-9; agree is the share of near ones whose slopes along translations are within 1e-3 (turns of things that
-    stand upright have other slopes to either side).
+    Meshes, placement and margin are those of the sample at its start. Peers are asked seven times where a pair is
+    nearer than the margin, else once. Columns: overlapping are pairs that intersect, near those nearer than the margin;
+    ratio is a peer's time over that here. differ counts, of the pairs that are apart, those whose distance is off by
+    more than 1e-9, of float32 1e-4; agree is the share of near ones whose slopes along translations are within 1e-3, of
+    float32 1e-2 (turns of things that stand upright have other slopes to either side).
     """
     device = wp.get_device(device)
     with contextlib.redirect_stdout(io.StringIO()):
@@ -49,24 +51,29 @@ def run(device, quick=False):
     with one_core() if device.is_cpu else contextlib.nullcontext():
         times = time_rounds({"ours": time_call(ask, device, clock)}, 3 if quick else 9)
     row |= {"ours_ms": medians(times)["ours"]}
+    matrices, meshes = np.tile(np.eye(4), (len(poses), 1, 1)), [m.mesh_at(m.lod_max)[:2] for m in models] * worlds
+    matrices[:, :3, 3] = poses[:, :3]
     with contextlib.suppress(ImportError):
-        row |= compare_fcl([model.mesh_at(model.lod_max)[:2] for model in models] * worlds, poses, pairs, margin, query)
+        from ..baselines.fcl import FclSlopes
+
+        row |= compare("fcl", FclSlopes(meshes, matrices), pairs, margin, query, (1e-9, 1e-3), time.thread_time)
         row["ratio"] = round(row["fcl_ms"] / row["ours_ms"], 1)
+    others = WarpMeshSlopes(meshes, matrices, device)
+    with one_core() if device.is_cpu else contextlib.nullcontext():
+        row |= compare("warp", others, pairs, margin, query, (1e-4, 1e-2), clock)
+    row["warp_ratio"] = round(row["warp_ms"] / row["ours_ms"], 1)
     yield row
 
 
-def compare_fcl(meshes, poses, pairs, margin, query):
-    """Return python-fcl's columns."""
-    from ..baselines.fcl import FclSlopes
-
-    matrices, answers = np.tile(np.eye(4), (len(poses), 1, 1)), []
-    matrices[:, :3, 3] = poses[:, :3]
-    other = FclSlopes(meshes, matrices)
-    ask = time_call(lambda: answers.append(other.slopes(pairs, margin)), "cpu", time.thread_time)
+def compare(name, other, pairs, margin, query, errors, clock) -> dict:
+    """Return a peer's columns, with errors of distances and slopes that are none."""
+    answers: list = []
+    ask = time_call(lambda: answers.append(other.slopes(pairs, margin)), query.device, clock)
     times = sorted(ask() for _ in range(3))
-    (distances, slopes), found = answers[0], query.run()
+    (distances, slopes), found = answers[-1], query.run()
     near = (found.distance > 0) & (found.distance < margin)
-    same = np.abs(slopes - found.gradient[:, 1])[:, :3].max(1) < 1e-3
-    differ = np.abs(distances - found.distance)[near] > 1e-9
-    differ = int(differ.sum() + (distances[np.isinf(found.distance)] < margin).sum())
-    return {"fcl_ms": times[1], "fcl_differ": differ, "fcl_agree": round(float(same[near].mean()), 3)}
+    same = np.abs(slopes - found.gradient[:, 1])[:, :3].max(1) < errors[1]
+    differ = int((np.abs(distances - found.distance)[near] > errors[0]).sum())
+    differ += int((distances[np.isinf(found.distance)] < margin).sum())
+    agree = round(float(same[near].mean()), 3)
+    return {f"{name}_ms": times[1], f"{name}_differ": differ, f"{name}_agree": agree}

@@ -2,8 +2,8 @@
 
 The margin of boxes covers every rounding between the exact x' of B's vertices and the float32 box test, its float64
 part x' itself and the shift between centres, and `skew` a rotation that is not orthonormal to the last bit, on whose
-columns B's axes are taken: docs/exactness.md has the terms. A gap along a unit axis is a distance, so `within` adds to
-the margin; a column is longer than 1 by at most `skew`.
+columns B's axes are taken: docs/exactness.md, bounds 7, 8 and 9. A gap along a unit axis is a distance, so `within`
+adds to the margin; a column is longer than 1 by at most `skew`.
 """
 
 import warp as wp
@@ -190,7 +190,7 @@ def pair_pose(whole: bool, trees: Trees, a: wp.int32, b: wp.int32, within: wp.fl
     margin64 = ROUNDING_64 * (size + wp.float64(2.0) * (reach_c + reach_b) + reach_a)
     margin64 = margin64 + wp.float64(4.0) * skew * (reach_b + far)
     margin32 = ROUNDING_32 * (reach_a + reach_b + far)
-    # Of a coordinate in `float32_filter_triangles`; docs/exactness.md has the terms, which need `near` below.
+    # Of a coordinate in `float32_filter_triangles`: docs/exactness.md, bound 1, whose terms need `near` below.
     off32 = UNIT_32 * (wp.float64(2.0) * reach_a + wp.float64(13.0) * reach_b + wp.float64(3.0) * far)
 
     pose = place_trees(trees, state_a, state_b)

@@ -17,7 +17,7 @@ rotations, for world points p and q of the surfaces and w = a - Ra^T (Rb b + tb 
    exceeds D: together 96 u S where D > 2^-19 S, else at most 2 PAIR_ROUNDING S.
 
 So d <= D (1 + 5 (s_a + s_b) + 2^-45) + 6 s_a A + 2^-45 S, and D is under the same of d, or S counts 2^-44 more where
-D is small: `stretch` and `slack_of`.
+D is small: `stretch` and `slack_of` (docs/exactness.md, bound 15).
 """
 
 import warp as wp

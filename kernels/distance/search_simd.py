@@ -2,7 +2,7 @@
 
 Node pairs go depth first, but those that are far for what has been found wait until something nearer may be: few are
 looked at then that a search from the answer would not. Faces are measured in float32, 16 at a time, within an error
-that is proven as in `triangle_pair` with u = 2^-24 and for the coordinates as in docs/exactness.md; float64 decides
+that is proven as in `triangle_pair` with u = 2^-24, coordinates too (docs/exactness.md, bound 16); float64 decides
 between those that may be the nearest. It is the same answer that warps give on CUDA.
 """
 

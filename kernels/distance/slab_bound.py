@@ -1,7 +1,7 @@
 """Lower bounds of the distances of two nodes by slabs and boxes together, for a lane of a warp.
 
 Along a direction, a node reaches no farther than its slab and its box do; across it, no farther than a ball about its
-box's centre; docs/exactness.md has the margins. The direction joins the nodes' middles, turned a little towards their
+box's centre: docs/exactness.md, bounds 17 and 18. The direction joins the nodes' middles, turned a little towards their
 mean normals: where small nodes face each other it is the one in which they are nearest, but for an angle like their
 size, so that such bounds err by the square of the size, where boxes err by the size.
 """

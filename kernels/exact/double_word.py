@@ -1,8 +1,9 @@
 """Signs in double-word arithmetic: twice the digits of float64 with a proven bound, for signs uncertain in float64.
 
 With the bounds of `native/exact/double_word.cuh` a determinant in 3D, three products deep with a difference between and
-two sums after, errs by less than 20 u^2 P, and in 2D by less than 9 u^2 P, P as in `predicates`; 64 u^2 P is taken,
-which has room for the rounding of P and the low word. Underflow changes nothing, for the reason given there.
+two sums after, errs by less than 20 u^2 P, and in 2D by less than 9 u^2 P, P as in `predicates`; 64 u^2 P is taken
+(docs/exactness.md, bound 5), which has room for the rounding of P and the low word. Underflow changes nothing, for the
+reason given there.
 """
 
 import warp as wp

@@ -1,7 +1,7 @@
 """Exact signs of determinants known to be small, in 128-bit integers that wrap: most often those that are 0.
 
 A determinant is a whole multiple of G, the product over its rows of the lowest bit set in any number of a row. Computed
-modulo 2^128 it is right to the bit once it is known to lie within 2^126 G; docs/exactness.md says where that is so.
+modulo 2^128 it is right to the bit once it is known to lie within 2^126 G: docs/exactness.md, bound 6.
 """
 
 import warp as wp

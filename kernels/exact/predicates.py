@@ -3,7 +3,8 @@ words, then in wrapping integers, and at last in integers as long as it takes.
 
 With e = 2^-53 the determinants below err by at most (8 + 128 e) e P in 3D and (3 + 16 e) e P in 2D, P the same sum with
 every product and difference of products replaced by the sum of magnitudes, computed in the same arithmetic. Coordinates
-are 0 or at least 2^-290, so underflow rounds nothing, and where P is 0 the sign is 0. docs/exactness.md has the proofs.
+are 0 or at least 2^-290, so underflow rounds nothing, and where P is 0 the sign is 0. Proofs:
+docs/exactness.md, bounds 3 and 4.
 """
 
 from typing import Any

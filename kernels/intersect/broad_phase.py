@@ -81,7 +81,8 @@ def pose_box_kernel(
     half = wp.float64(0.5) * (upper - lower)
     box_lower = wp.vec3()
     box_upper = wp.vec3()
-    # B is taken to A's frame by the transpose: where that is no inverse, A stands off by (R R^T - I) of its points.
+    # B is taken to A's frame by the transpose: where that is no inverse, A stands off by (R R^T - I) of its points:
+    # docs/exactness.md, bound 13.
     skew = wp.float64(3.0) * measure_skew(rotation)
     more = wide
     if reach.shape[0] > 0:

@@ -113,7 +113,7 @@ def pose_leaf(trees: Trees, pose: PairPose, node: wp.int32, of_b: bool):
         load_near(trees.models, corners[2]),
     )
     p, q, r = map_point(rotation, shift, near_p), map_point(rotation, shift, near_q), map_point(rotation, shift, near_r)
-    # Corners are rounded where boxes are not; docs/exactness.md has the terms.
+    # Corners are rounded where boxes are not: docs/exactness.md, bound 10.
     margin = pose.margin + pose.margin
     leaf.posed_lower = wp.min(p, wp.min(q, r)) - wp.vec3(margin, margin, margin)
     leaf.posed_upper = wp.max(p, wp.max(q, r)) + wp.vec3(margin, margin, margin)

@@ -18,7 +18,8 @@ in the model frames, B's point b lies in A's frame at R b + x, where it moves wi
    where ' is a distance from A's axis; the same of A's points in B's frame with the names exchanged. Where B does not
    turn, y moves straight and |y|' is largest at an end and a corner of B's box; else |y|' <= |b'| + |d|.
 2. So along a unit n that is fixed in A's frame a point that is g over a plane at t is still over it at t + h if
-   g + h s - M h^2 / 2 > 0, s = n . (K b + v) and M the bound of 1. `step_of` takes the root.
+   g + h s - M h^2 / 2 > 0, s = n . (K b + v) and M the bound of 1 (docs/exactness.md, bound 19). `step_of`
+   takes the root.
 3. Rounding. E errs by 20 u in each entry, u = 2^-53, R by 70 u; axes times angles by 8 u, which moves points by 16 u
    of their distance from the anchor. With S = |a'| + |b'| + |d| + |anchors| points in A's frame err by under 2^-45 S,
    and velocities by 2^-45 (S (A + B) + |d1|), but for what axes of slow turns are off: under 2^-45 S in unit time,

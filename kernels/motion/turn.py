@@ -51,7 +51,8 @@ def turn_matrix(axis: wp.vec3d, angle: wp.float64):
 def angle_of(s: wp.float64, c: wp.float64):
     """Return twice the angle whose sine and cosine these are, both from 0 to 1.
 
-    r / (1 + 0.28 r^2) is within 0.005 of it, and a step leaves e - sin e < e^3 / 6 of an error e: 2^-25, then 2^-79.
+    r / (1 + 0.28 r^2) is within 0.005 of it, and a step leaves e - sin e < e^3 / 6 of an error e: 2^-25, then 2^-79
+    (docs/exactness.md, bound 20).
     """
     least, most = wp.min(s, c), wp.max(s, c)
     r = least / most

@@ -8,9 +8,12 @@ middle, and so does its axis. A turn T takes a point p that outer joints have mo
     |T q - p| <= |T q - T p| + |T p - p| = |q - p| + |T p - p|
 
 and |T p - p| is at most the angle times the distance of p from the axis, both in the middle. So the reach of a part is
-the sum over its joints of angle times distance of its farthest point, or of how far a joint slides.
+the sum over its joints of angle times distance of its farthest point, or of how far a joint slides (docs/exactness.md,
+bound 22).
 
 The joints that both parts of a pair hang on move them as one and do not count.
+
+A padded part counts as thicker by its padding: parts meet where they are not proved farther apart than both paddings.
 """
 
 import warp as wp
@@ -21,7 +24,7 @@ from warp_abtree.kernels.robot.forward import PRISMATIC, REVOLUTE, Chain, Frames
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-ASK_ANY, ASK_WITHIN, ASK_DISTANCE = wp.constant(0), wp.constant(1), wp.constant(2)
+ASK_ANY, ASK_WITHIN, ASK_DISTANCE, ASK_PADDED = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
 
 # Of a reach, where fixed transforms are rigid within 1e-12; and of poses: a frame turns what hangs on it by some 50 u
 # too much, u = 2^-53, and these add up along the way.
@@ -43,6 +46,7 @@ class Parts:
     depth: wp.array(dtype=wp.int32)  # frames that it hangs on, shape [part]
     middle: wp.array(dtype=wp.vec3d)  # of a sphere around its vertices, in its frame [robot units], shape [part]
     radius: wp.array(dtype=wp.float64)  # of the sphere [robot units], shape [part]
+    padding: wp.array(dtype=wp.float64)  # added to its shape [robot units], shape [part]; of ASK_WITHIN, ASK_PADDED
     first: wp.array(dtype=wp.int32)  # part, shape [entry]
     second: wp.array(dtype=wp.int32)  # other part, -1 for the surroundings, shape [entry]
     shared: wp.array(dtype=wp.int32)  # last frame that both parts hang on, -1 for none, shape [entry]
@@ -90,8 +94,8 @@ def part_reach(chain: Chain, frames: Frames, parts: Parts, chunk: Chunk, i: wp.i
 
 @wp.func
 def pair_reach(mode: wp.int32, chain: Chain, frames: Frames, parts: Parts, chunk: Chunk, i: wp.int32, entry: wp.int32):
-    """Return the distance within which the parts of an entry are tested at a configuration [robot units]."""
-    if mode == ASK_ANY:
+    """Return the distance within which the parts of an entry are tested at a configuration, paddings apart."""
+    if mode == ASK_ANY or mode == ASK_PADDED:
         return wp.float64(0.0)
     if mode == ASK_DISTANCE:
         return chunk.best[i]
@@ -100,6 +104,17 @@ def pair_reach(mode: wp.int32, chain: Chain, frames: Frames, parts: Parts, chunk
     if second >= 0:
         reach += part_reach(chain, frames, parts, chunk, i, second, shared)
     return reach
+
+
+@wp.func
+def pair_padding(mode: wp.int32, parts: Parts, entry: wp.int32):
+    """Return by how much the parts of an entry are padded together [robot units]."""
+    padding = wp.float64(0.0)
+    if mode == ASK_WITHIN or mode == ASK_PADDED:
+        padding = parts.padding[parts.first[entry]]
+        if parts.second[entry] >= 0:
+            padding += parts.padding[parts.second[entry]]
+    return padding
 
 
 @wp.struct
@@ -159,9 +174,10 @@ def find_link_pair_kernel(
     for entry in range(stage[0], stage[1]):
         first, second = base + parts.first[entry], parts.second[entry]
         reach = pair_reach(mode, chain, frames, parts, chunk_inout, i, entry)
-        wide = wp.float64(reach)
-        if mode == ASK_WITHIN and reach > HOPELESS * parts.radius[parts.first[entry]]:
-            reach = wp.float64(0.0)
+        padding = pair_padding(mode, parts, entry)
+        wide = reach + padding
+        hopeless = mode == ASK_WITHIN and reach > HOPELESS * parts.radius[parts.first[entry]]
+        within = wp.where(hopeless, padding, wide)
         least, most = boxes.lower[first], boxes.upper[first]
         if mode != ASK_ANY:
             for k in range(3):
@@ -171,12 +187,12 @@ def find_link_pair_kernel(
             query = wp.bvh_query_aabb(boxes.bvh, least, most)
             while wp.bvh_query_next(query, j):
                 if parts.meets[j] != wp.uint8(0):
-                    if wide > reach:
+                    if hopeless:
                         chunk_inout.near[i] = wp.uint8(1)
-                    append_link_pair(first, j, reach, batch_inout, distances_out)
+                    append_link_pair(first, j, within, batch_inout, distances_out)
         else:
             j = base + second
             if boxes_meet(least, most, boxes.lower[j], boxes.upper[j]):
-                if wide > reach:
+                if hopeless:
                     chunk_inout.near[i] = wp.uint8(1)
-                append_link_pair(first, j, reach, batch_inout, distances_out)
+                append_link_pair(first, j, within, batch_inout, distances_out)

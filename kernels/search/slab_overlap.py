@@ -2,8 +2,8 @@
 
 Boxes of faces that look aside reach beyond the surface, so that those of nested surfaces overlap all over. A slab says
 how far the faces below a node reach along the direction in which they are thinnest. Along either node's direction n the
-other is bounded by its own slab, along m, and its box: n . x = a m . x + (n - a m) . x, whatever a. docs/exactness.md
-has the margin. A record:
+other is bounded by its own slab, along m, and its box: n . x = a m . x + (n - a m) . x, whatever a. The
+margin is docs/exactness.md, bound 12. A record:
 
     127        96 95         64 63      48 47      32 31      16 15       0
     [    size    |     sum     |     0    |     z    |     y    |     x    ]    x, y, z of the direction plus 2^14

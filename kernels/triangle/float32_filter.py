@@ -4,7 +4,7 @@ It comes in two parts: planes separate most face pairs; only of those that strad
 Source: as `intersect_triangles`.
 
 Coordinates are about A's centre, scaled to about unit size; differences of corners are off by less than `error`, and
-the arithmetic of a determinant by `unit` of its size. docs/exactness.md proves the bound. With both 0 every sign is the
+the arithmetic of a determinant by `unit` of its size. docs/exactness.md, bound 2. With both 0 every sign is the
 computed one.
 
 `native/triangle/float32_filter.cuh` has the determinants, of one pair or, for `simd.simd_float32_filter`, of 16.

@@ -22,7 +22,8 @@ longer than 4 L.
    n = e x f, and errs by d of at most 16 u |r| / (s |e|) + 16 u / s, or 1 if that is more. The second is the best for
    the first, then the first the best for the second. Squared distances, each parameter the best for the other, are a
    parabola of curvature |e|^2 s^2: too long by at most (|e| s d)^2, under (128 u L)^2, whatever s is.
-5. So what is returned differs from the distance of the triangles by under 256 u L: `PAIR_ROUNDING` of L.
+5. So what is returned differs from the distance of the triangles by under 256 u L: `PAIR_ROUNDING` of L
+   (docs/exactness.md, bound 14).
 
 `tests/distance/test_triangle_pair.py` holds it to fractions.
 """

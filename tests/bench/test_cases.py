@@ -184,6 +184,7 @@ def check_gradients(rows):
     (row,) = rows
     assert row["pairs"] == 56 > row["near"] >= row["overlapping"] > 5
     assert row.get("fcl_differ", 0) == 0 and row.get("fcl_agree", 1) == 1
+    assert row["warp_differ"] == 0 < row["warp_agree"] and row["warp_ratio"] > 0
 
 
 def check_robot(rows):

@@ -150,6 +150,8 @@ def test_launches_of_every_kind_give_the_same(device):
     query.launch()
     assert on_device.gradient.numpy().tobytes() == expected
     assert pickle.loads(pickle.dumps(result)).gradient.tobytes() == expected
+    assert repr(result) == "Result(pairs=12, any, points, distance, bracket, point_faces, gradient)"
+    assert repr(on_device) == repr(result)
     assert "gradient" not in result.rows()[0] and scene.intersect(pairs).gradient is None
     row = in_a_row(device, "box", (0, 1.5, 9)).intersect(None, "distance", beyond=1.0)
     np.testing.assert_array_equal(row.gradient[:, :, :3], [[[-1, 0, 0], [1, 0, 0]]])

@@ -103,9 +103,52 @@ def visit_other(pair: wp.int32, faces: wp.vec2i, trees: Trees, pose: wp.int32, o
     return True
 
 
+@wp.func
+def visit_without_value(pair: wp.int32, faces: wp.vec2i, trees: Trees, pose: PairPose, own: LeastDistance):
+    wp.atomic_min(own.least, pair, wp.int64(0))
+
+
+@wp.func
+def visit_half(pair: wp.int32, faces: wp.vec2i, trees: Trees, pose: PairPose, own: LeastDistance):
+    if pair > 0:
+        return True
+
+
+@wp.func_native("own.least[pair] = 0;")
+def visit_native(pair: wp.int32, faces: wp.vec2i, trees: Trees, pose: PairPose, own: LeastDistance): ...
+
+
+@wp.func
+def visit_all_ways(pair: wp.int32, faces: wp.vec2i, trees: Trees, pose: PairPose, own: LeastDistance):
+    if pair > 1:
+        return True
+    elif pair == 1:
+        for i in range(2):
+            if i == pair:
+                return True
+        return False
+    else:
+        return False
+
+
+@wp.func_native("return true;")
+def visit_in_cpp(pair: wp.int32, faces: wp.vec2i, trees: Trees, pose: PairPose, own: LeastDistance) -> wp.bool: ...
+
+
+@pytest.mark.parametrize(("visit", "hits"), [(visit_all_ways, [False, True]), (visit_in_cpp, [True, True])])
+def test_takes_what_returns_on_all_ways(device, visit, hits):
+    scene = ab.Scene(device=device)
+    for _ in range(2):
+        scene.add(ab.Model.load(trimesh.creation.box()))
+    assert FaceQuery(scene, visit, LeastDistance(), [(0, 1), (1, 0)]).run().any.tolist() == hits
+
+
 @pytest.mark.parametrize(
     ("visit", "own", "message"),
     [
+        (visit_without_value, LeastDistance(), "visit_without_value: ends without a value; return a bool"),
+        (visit_half, LeastDistance(), "visit_half: ends without a value"),
+        (visit_native, LeastDistance(), "visit_native: ends without a value"),
         (lambda *given: True, LeastDistance(), "visit: a Warp function .* not a function"),
         (visit_less, LeastDistance(), r"visit_less: takes \(pair, faces\), not \(pair, faces, trees, pose, own\)"),
         (visit_other, LeastDistance(), "visit_other: pose is a int32, given is a .*PairPose"),

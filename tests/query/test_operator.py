@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from helpers import refused
 from helpers.faults import MORE_PAIRS, add_objects, check_buffer_lengths
 from helpers.samples import random_poses, sample
 
@@ -10,6 +11,7 @@ import warp_abtree as ab
 from warp_abtree import testing
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.stage import Array, Stage
+from warp_abtree.query.stages.faces import FaceQuery, PairPose, Trees
 from warp_abtree.query.stages.inside import InsideStage
 from warp_abtree.query.stages.intersect import IntersectStage
 
@@ -22,6 +24,16 @@ def count_per_object_kernel(
     if p < pair_count[0] and hits[p] != 0:
         wp.atomic_add(count, pairs[p][0], 1)
         wp.atomic_add(count, pairs[p][1], 1)
+
+
+@wp.struct
+class Nothing:
+    none: wp.int32
+
+
+@wp.func
+def visit_nothing(pair: wp.int32, faces: wp.vec2i, trees: Trees, pose: PairPose, own: Nothing):
+    return False
 
 
 class TouchingStage(Stage):
@@ -42,6 +54,19 @@ class TouchingStage(Stage):
 
     def read(self, found, device, with_rows):
         found.points = self.count.numpy()
+
+
+@pytest.mark.parametrize("scene", [None, "cpu", ab.Scene])
+@pytest.mark.parametrize(
+    "make",
+    [
+        *(ab.Query, ab.ContactQuery, ab.ManifoldQuery, ab.DistanceQuery),
+        lambda scene: ab.FirstContactQuery(scene, None),
+        lambda scene: FaceQuery(scene, visit_nothing, Nothing()),
+    ],
+)
+def test_refuses_what_is_no_scene(make, scene):
+    refused(TypeError, f"scene: a Scene or Batch is expected, not a {type(scene).__name__}$", make, scene)
 
 
 @pytest.mark.parametrize("pairs", [None, MORE_PAIRS])

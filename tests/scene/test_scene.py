@@ -161,7 +161,7 @@ POSES = {
     "not finite": (np.array((0, NAN, 0, 0, 0, 0, 1)), "finite"),
     "quaternion not finite": (np.array((0, 0, 0, 0, 0, INF, 1)), "finite"),
     "not normalised": (np.array((0, 0, 0, 0, 0, 0, 1.002)), "quaternion", "1.002"),
-    "no quaternion": (np.zeros(7), "quaternion"),
+    "no quaternion": (np.zeros(7), "quaternion of norm 0, which is no rotation", "0 0 0 1"),
     "a number": (1.0, "shape"),
     "skewed": (TURN + 1e-4 * np.diag([1, 0, 0, 0]), "rigid"),
     "mirror": (np.diag([1.0, 1.0, -1.0, 1.0]), "rigid"),

@@ -2,6 +2,7 @@
 
 import math
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from warp_abtree.interop.placed_shapes import PlacedShapes, shape_of
 from warp_abtree.state.poses import check_poses
 
 EXTERNAL = "__external"  # trimesh's name for a mesh that is not in the manager
+DEPTH_TOLERANCE = 2.0**-40  # of `Scene.penetration`
 FIRST_PAIRS = 64  # tested first if one collision is enough
 
 
@@ -35,18 +37,22 @@ class ContactData(PairData):
         names: Names of the two objects, a set.
         point: Midpoint of the segment [world units], float64 (3,).
         normal: Unit normal from the first object of the pair to the second, float64 (3,).
-        depth: How far the deepest point of one object inside the other, a solid, is from the surface; of surfaces, how
-            deep the two faces are in one another [world units].
+        depth: Penetration depth of the two objects, that of `Scene.penetration` [world units]: as far as `way_out`.
         segment: End points of the segment in which the two faces intersect; where one object is wholly inside the
-            other, that deepest point and the surface's nearest one [world units], float64 (2, 3).
+            other, its deepest point and the surface's nearest one [world units], float64 (2, 3).
     """
 
-    __slots__ = ("depth", "normal", "point", "segment")
+    __slots__ = ("_ways", "depth", "normal", "point", "segment")
 
-    def __init__(self, names, faces, segment, normal, depth):
+    def __init__(self, names, faces, segment, normal, depth, way):
         super().__init__(names, faces)
         self.segment, self.normal, self.depth = segment, normal, depth
         self.point = 0.5 * (segment[0] + segment[1])
+        self._ways = dict(zip(names, (-way, way)))
+
+    def way_out(self, name) -> np.ndarray:
+        """Return the translation that frees the named object from the other one [world units], float64 (3,)."""
+        return self._ways[name]
 
 
 class DistanceData(PairData):
@@ -85,8 +91,9 @@ class CollisionManager(DeviceMemory):
 
     * Answers are exact for the given poses, also of convex meshes. Touching is a collision, and so is what lies inside
       any closed mesh.
-    * A contact is a pair of intersecting faces, see `ContactData`. An object wholly inside a solid gives one, whose
-      segment joins its deepest point and the surface.
+    * A contact is a pair of intersecting faces, see `ContactData`. Its depth is the penetration depth of the two
+      objects, whatever their shapes: the same in all contacts of a pair. An object wholly inside a solid gives one
+      contact, whose segment joins its deepest point and the surface.
     * Distances [world units] are negative where solids are deep in one another, by how far the deepest point of one in
       the other is from the surface (`query.stages.distance`), a lower bound of the penetration depth; 0 where surfaces
       merely intersect, infinite if there are no objects.
@@ -305,25 +312,22 @@ class CollisionManager(DeviceMemory):
         if not return_data:
             hit = np.flatnonzero(scene.intersect(pairs, output="any").any)
             return bool(len(hit)), [names[k] for k in hit.tolist()], []
-        result = scene.intersect(pairs, output="contacts", gap=0.0)
+        result = scene.intersect(pairs, output="contacts")
         hit = np.flatnonzero(result.any)
-        deep = scene.intersect(pairs[hit], "distance", signed=scene.batch().has_solid(pairs[hit]))
-        depth = np.zeros(len(pairs))
-        depth[hit] = -deep.distance
+        found = scene.penetration(pairs[hit], tolerance=DEPTH_TOLERANCE)
+        ways = {k: found.depth[row] * found.direction[row] for row, k in enumerate(hit.tolist())}
+        depths = dict(zip(hit.tolist(), found.depth.tolist()))
         rows = result.contacts
-        own = depth[rows["pair"]]
-        depths = np.where(own > 0, own, np.maximum(-rows["separation"], 0)).tolist()
         segments = np.stack([rows["p0"], rows["p1"]], 1)
-        contacts = [
-            ContactData(names[k], *of)
-            for k, *of in zip(rows["pair"].tolist(), rows["faces"].tolist(), segments, rows["normal"], depths)
-        ]
-        for row in np.flatnonzero(result.count[hit] == 0).tolist():
+        listed = zip(rows["pair"].tolist(), rows["faces"].tolist(), segments, rows["normal"])
+        contacts = [ContactData(names[k], f, segment, n, depths[k], ways[k]) for k, f, segment, n in listed]
+        nested = hit[result.count[hit] == 0]
+        deep: Any = scene.intersect(pairs[nested], "distance", signed=True) if len(nested) else None
+        for row, k in enumerate(nested.tolist()):
             points, deepest = deep.points[row], -deep.distance[row]
-            # Whichever of the two is inside, it is the way out of the second object.
-            normal = (points[0] - points[1]) / deepest
-            faces = deep.point_faces[row].tolist()
-            contacts.append(ContactData(names[hit[row]], faces, points, normal, float(deepest)))
+            # Whichever of the two is inside, it points as the second object leaves.
+            normal, faces = (points[0] - points[1]) / deepest, deep.point_faces[row].tolist()
+            contacts.append(ContactData(names[k], faces, points, normal, depths[k], ways[k]))
         return bool(len(hit)), [names[k] for k in hit.tolist()], contacts
 
     def _nearest(self, pairs, names):

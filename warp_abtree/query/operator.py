@@ -24,7 +24,7 @@ from warp_abtree.query.readout import Readout, operator_kernels
 from warp_abtree.query.request import LIST_MAX, check_capacity, check_pair_room, more_room
 from warp_abtree.query.result import Found, Result
 from warp_abtree.query.stage import Array, PairDistance, Rooms, Stage
-from warp_abtree.state.batch import Batch
+from warp_abtree.state.batch import Batch, scene_or_batch
 from warp_abtree.state.generation import LaunchGuard
 
 # Face pairs that the float32 stage leaves uncertain: about one in a hundred. The list grows as needed.
@@ -64,7 +64,7 @@ class Operator(DeviceMemory):
     given: Any = None
 
     def __init__(self, scene, stages: list[Stage], pairs=None, capacity=None, output="any", sort_pairs=False):
-        check_device(scene.device, f"making a {type(self).__name__}")
+        check_device(scene_or_batch(scene).device, f"making a {type(self).__name__}")
         room = check_capacity(capacity)
         self.device, self.regime, self.stages, self.output = scene.device, current_regime(), stages, output
         self.lanes = WARP_SIZE if self.device.is_cuda else 1  # threads of a warp

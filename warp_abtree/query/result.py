@@ -150,6 +150,7 @@ class Result(DeviceMemory):
 
     def __repr__(self):
         held = [name for name in (*RESULT_ARRAYS[1:], "count") if getattr(self, name) is not None]
+        held += ["gradient"] if self._gradient is not None else []
         return f"Result(pairs={len(self.pairs)}, {', '.join(held)})"
 
     @property

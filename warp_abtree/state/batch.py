@@ -215,6 +215,13 @@ class Batch(DeviceMemory):
         return check_pairs(pairs, self.object_count, self.removed)
 
 
+def scene_or_batch(scene):
+    """Return a `Scene` or `Batch`; raise TypeError for anything else."""
+    if not isinstance(scene, Batch) and not callable(getattr(type(scene), "batch", None)):
+        raise TypeError(f"scene: a Scene or Batch is expected, not a {type(scene).__name__}")
+    return scene
+
+
 def check_pairs(pairs, object_count: int, removed=()) -> np.ndarray:
     """Return object pairs as int32 (p, 2).
 

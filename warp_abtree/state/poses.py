@@ -8,6 +8,7 @@ from warp_abtree.kernels.io import place_poses
 
 QUATERNION_TOLERANCE = 1e-3
 RIGID_TOLERANCE = 1e-6
+ZERO_QUATERNION = "which is no rotation; a pose is x y z qx qy qz qw, and one that does not turn ends in 0 0 0 1"
 # As a tolerance of quaternions: those of any norm but 0 are normalised.
 ANY_NORM = 1e308
 # A matrix that is no farther off was rigid before rounding, for all that its numbers tell.
@@ -51,10 +52,8 @@ def check_poses(poses, what="poses", first=0, removed=()) -> np.ndarray:
         sound = np.abs(norm - 1) <= QUATERNION_TOLERANCE
         if not sound.all():
             i = int(sound.argmin())
-            raise ValueError(
-                f"{what}: pose {first + i} has a quaternion of norm {norm[i]:.6g}, "
-                f"off 1 by more than {QUATERNION_TOLERANCE}"
-            )
+            why = f"off 1 by more than {QUATERNION_TOLERANCE}" if norm[i] else ZERO_QUATERNION
+            raise ValueError(f"{what}: pose {first + i} has a quaternion of norm {norm[i]:.6g}, {why}")
         return poses
     rotation = poses[:, :3, :3]
     off = np.abs(rotation.transpose(0, 2, 1) @ rotation - IDENTITY)

@@ -58,7 +58,7 @@ static_assert(2 * (TILE_HITS + TILE_HITS_LENGTH) <= ITEM_BYTES * (SLAB_PAIR_STAR
 constexpr int NEAREST_OPEN_START = 672;
 constexpr int NEAREST_OPEN_LENGTH = 64;
 constexpr int NEAREST_LENGTH = 736;
-// Margins of boxes that a bound by slabs leaves off, of twice the distance (docs/exactness.md).
+// Margins of boxes that a bound by slabs leaves off, of twice the distance (docs/exactness.md, bounds 17 and 18).
 constexpr int SLAB_MARGINS = 10;
 static_assert(NEAREST_OPEN_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie one behind the other");
 static_assert(NEAREST_LENGTH == NEAREST_OPEN_START + NEAREST_OPEN_LENGTH, "lists lie one behind the other");

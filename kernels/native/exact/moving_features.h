@@ -1,6 +1,6 @@
 // Proof that a corner and a face, or two edges, stay apart for some time while their corners move straight.
 // Polynomials of time are in Bernstein's form: where all coefficients have a sign, they have it at all times between.
-// docs/exactness.md derives the bounds of what they err by.
+// What they err by: docs/exactness.md, bound 21.
 #pragma once
 #include "builtin.h"
 #include "exact/double_word.cuh"

@@ -126,9 +126,9 @@ void open_subtrees(const ModelPool& models, const StatePool& states, const PairP
         }
         // Slabs of A depend on A alone, which keeps them for other pairs. Where A is flat, numbers could overflow.
         const double steps = d < 14 && size * 0x1p20 > reach ? 65536.0 / size : 0.0;
-        // Three times the margin of boxes covers all rounding, see docs/exactness.md. A direction that tells nothing,
-        // since the margin is half of A's size or more, has slabs of B that reach everywhere.
-        // Of a margin for distances, what is not for rounding counts once.
+        // Three times the margin of boxes covers all rounding: docs/exactness.md, bound 11. A direction that tells
+        // nothing, since the margin is half of A's size or more, has slabs of B that reach everywhere. Of a margin for
+        // distances, what is not for rounding counts once.
         const double margin = steps * (3.0 * pose.margin - 1.99 * pose.within);
         const double scale = margin < 32768.0 ? steps : 0.0;
         for (int j = 0; j < 3; ++j) {

@@ -34,7 +34,8 @@ struct PlaneFilter {
         of_a = over_plane(F::minus(b[1], b[0]), F::minus(b[2], b[0]), w, F::minus(b[0], a[1]), F::minus(b[0], a[2]));
         of_b = over_plane(F::minus(a[1], a[0]), F::minus(a[2], a[0]), back, F::minus(a[0], b[1]), F::minus(a[0], b[2]));
     }
-    // Beyond which points are farther than a gap from the plane of corners; docs/exactness.md. Squares may underflow.
+    // Beyond which points are farther than a gap from the plane of corners: docs/exactness.md, bound 23. Squares may
+    // underflow.
     CUDA_CALLABLE lanes widen(const lanes& bound, float gap, const Point (&c)[3]) const {
         const Point u = F::minus(c[1], c[0]), v = F::minus(c[2], c[0]), normal = F::cross(u, v);
         const lanes p = F::sum_sizes(u) + 2.0f * error, q = F::sum_sizes(v) + 2.0f * error;

@@ -22,6 +22,7 @@ from warp_abtree.checks.arguments import (
 from warp_abtree.interop.robot.check import RobotQuery, check_edges
 from warp_abtree.interop.robot.description import Description, RobotError, read_pose
 from warp_abtree.interop.robot.files import read_robot
+from warp_abtree.interop.robot.link_query import padding_of
 from warp_abtree.interop.robot.surroundings import STILL, make_surroundings
 from warp_abtree.kernels.robot import forward
 from warp_abtree.model.model import Model
@@ -49,10 +50,12 @@ class Robot:
         model_link: Index into `link_names` of each model, int (m,).
         pairs: Pairs of models that are tested against one another, int (p, 2).
         mounted: Indices into `link_names` of the links that are not tested against what surrounds the robot.
+        link_padding: Distances [world units] that are added to the shapes of links in `check` and `check_edges`, a dict
+            by name, none at first: links meet within the sum of both, a link and an object of the world within its own.
         description: What it is made of, `warp_abtree.interop.robot.description.Description`.
 
-    `pairs` and `mounted` may be set: each call goes by what they are then. A copy, or what is unpickled, is made anew
-    from the description, on the same device, with `pairs` and `mounted`.
+    `pairs`, `mounted` and `link_padding` may be set: each call goes by what they are then. A copy, or what is
+    unpickled, is made anew from the description, on the same device, with these.
     """
 
     def __init__(self, description: Description, device=None, mounted=()):
@@ -67,6 +70,7 @@ class Robot:
         self.pairs = np.array(description.allowed_pairs(), np.int64).reshape(-1, 2)
         self._describe(description)
         self.mounted: list[int] = []
+        self.link_padding: dict[str, float] = {}
         body = description.bodies()[list(description.links.values())]
         for k in self._find_links(mounted, "mounted"):
             fixed = [k] if k in self.model_link else np.flatnonzero(body == body[k]).tolist()
@@ -159,7 +163,7 @@ class Robot:
         return [self.link_names.index(name) for name in names]
 
     def __reduce__(self):
-        kept = {"pairs": self.pairs, "mounted": self.mounted}
+        kept = {"pairs": self.pairs, "mounted": self.mounted, "link_padding": self.link_padding}
         return type(self), (self.description, self.device.alias), kept
 
     def __repr__(self):
@@ -207,6 +211,7 @@ class Robot:
         link = self.link_names.index(name)
         k = self.model_link.tolist().index(link)
         self.mounted = [other - (other > link) for other in self.mounted if other != link]
+        self.link_padding = {other: self.link_padding[other] for other in self.link_padding if other != name}
         self.models, pairs = self.models[:k] + self.models[k + 1 :], pairs[(pairs != k).all(1)]
         self.pairs = pairs - (pairs > k)
         self._describe(description)
@@ -373,6 +378,7 @@ class Robot:
         """Return a query of a room for a number of configurations: the one of before if it is of the same."""
         around, key = make_surroundings(world, self.device)
         key = (*key, check_pairs(self.pairs, len(self.models)).tobytes(), tuple(self.mounted))
+        key += (padding_of(self).tobytes(),)
         rooms = ROOMS["cpu" if self.device.is_cpu else "cuda"]
         room = next((room for room in rooms if room >= count), rooms[-1])
         query = self._kept.pop((key, output, room), None)

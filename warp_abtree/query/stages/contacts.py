@@ -70,7 +70,7 @@ from warp_abtree.query.stages.inside import InsideStage
 from warp_abtree.query.stages.intersect import ApartStage, GapStage, IntersectStage
 from warp_abtree.query.stages.slots import SlotStage
 from warp_abtree.query.staging import first_rows
-from warp_abtree.state.batch import Batch
+from warp_abtree.state.batch import Batch, scene_or_batch
 
 # Warps that a multiprocessor runs at a time, by their registers, of those that find deferred contacts, and of those
 # that find contacts of faces that are apart.
@@ -314,7 +314,7 @@ def plan_contacts(precision, within, gap, sums: bool, dtype: Any = np.float64, m
 
 def warn_of_winding(scene):
     """Warn of models of a scene whose winding is not what normals of contacts take it for."""
-    for model in () if isinstance(scene, Batch) else scene.models:
+    for model in () if isinstance(scene_or_batch(scene), Batch) else scene.models:
         model.warn_of_winding("the normals of its contacts depend on the winding")
 
 

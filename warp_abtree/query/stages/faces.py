@@ -1,5 +1,6 @@
 """Questions of one's own about face pairs: `FaceQuery`, and the Warp types and functions that a visit is written in."""
 
+import ast
 from typing import Any
 
 import warp as wp
@@ -46,7 +47,22 @@ def _check_visit(visit, own):
         if kind is not Any and not types_equal(kind, expected):
             kinds = (getattr(k, "key", getattr(k, "__name__", k)) for k in (kind, expected))
             raise TypeError("visit {}: {} is a {}, given is a {}".format(visit.key, name, *kinds))
+    native, source = visit.native_snippet is not None, visit.adj
+    if not ("return" in source.arg_types if native else _returns(source.tree.body[0].body)):
+        raise TypeError(f"visit {visit.key}: ends without a value; return a bool everywhere, whether the pair is a hit")
     return given
+
+
+def _returns(body) -> bool:
+    """Return whether each way through a block returns a value."""
+    for line in body:
+        if isinstance(line, ast.Return) and line.value is not None:
+            return True
+        if isinstance(line, ast.If) and _returns(line.body) and _returns(line.orelse):
+            return True
+        if isinstance(line, ast.While) and isinstance(line.test, ast.Constant):
+            return True
+    return False
 
 
 class FaceQuery(Operator):
@@ -66,7 +82,8 @@ class FaceQuery(Operator):
         for_any: Whether one hit is enough: a pair is visited until there is one.
 
     Raises:
-        TypeError: visit is no Warp function of these arguments, or own no Warp struct of its last one's type.
+        TypeError: visit is no Warp function of these arguments, or does not always return a value; or own is no Warp
+            struct of its last one's type.
         ValueError: Bad pairs or distances, an empty scene.
         RuntimeError: A graph is being captured.
     """
