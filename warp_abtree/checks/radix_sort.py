@@ -6,7 +6,7 @@ from pathlib import Path
 
 import warp as wp
 
-ATTEMPTS = 4  # on a busy GPU one of some thousand sorts fails
+SORT_ATTEMPTS = 4  # on a busy GPU one of some thousand sorts fails
 
 
 def radix_sort(keys: wp.array, values: wp.array, count: int, bits: int):
@@ -18,7 +18,7 @@ def radix_sort(keys: wp.array, values: wp.array, count: int, bits: int):
     Raises:
         RuntimeError: Warp did not sort them, several times.
     """
-    for _ in range(ATTEMPTS):
+    for _ in range(SORT_ATTEMPTS):
         ctypes.memset(_error_address(), 0, 1)
         with wp.ScopedDevice(keys.device):
             wp.utils.radix_sort_pairs(keys, values, count, end_bit=bits)
