@@ -213,7 +213,8 @@ class ManifoldQuery(Operator):
 
     Args:
         scene, pairs, precision, gap: As for `ContactQuery`.
-        capacity: `Buffers`, or the hits that there is room for: contacts of faces that cross, and witnesses.
+        capacity: `Buffers`, or the hits that there is room for: contacts of faces that cross, and witnesses. Where `run`
+            and `grow` would need long lists, parts of the pairs take turns in shorter ones (`query.point_parts`).
         points: Most points of a pair, 1 to 64. A pair has fewer where these hold against all twists.
         remember: How far [world units] the points of a pair's smaller object may move, as the other one sees it, until
             the pair is searched again: while it rests it keeps the points of its last search, moved with the objects,
@@ -231,6 +232,7 @@ class ManifoldQuery(Operator):
             With `remember` also `before`, the place that each point had among its pair's in the launch before, -1 for a
             new one: what warm starting needs. Results have it as `points["before"]`.
         contacts: Contacts of faces that cross, as of `ContactQuery`, without separations; faces and start as there.
+            Where parts of the pairs took turns, these and what follows are those of the last part, by places in it.
         curves: Loops of these contacts, device arrays (capacity,) of `kernels.contacts.manifold.Curves`.
         witness_rows: Face pairs that the slots of each pair keep, those of pair p at start[p] to start[p] + count[p],
             of `kernels.contacts.slots.WitnessRows`; an item that begins with -1 is none.
