@@ -46,7 +46,11 @@ from warp_abtree.kernels.search.nearest_stack import NEAREST_MEMORY, nearest_sta
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, write_item
 
 MODULE_OPTIONS = native.options(
-    "base/lanes.cuh", "exact/determinant.cuh", "search/load_balance.cuh", "search/nearest_stack.cuh"
+    "base/lanes.cuh",
+    "distance/point_boxes.cuh",
+    "exact/determinant.cuh",
+    "search/load_balance.cuh",
+    "search/nearest_stack.cuh",
 )
 wp.set_module_options(MODULE_OPTIONS)
 

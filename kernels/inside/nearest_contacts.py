@@ -13,7 +13,7 @@ from warp_abtree.kernels.distance.frame import make_scale
 from warp_abtree.kernels.inside.nearest_face import make_solid, nearest_face
 from warp_abtree.kernels.intersect.face_pairs import PAIR_MASK, Hits
 
-wp.set_module_options(native.options())
+wp.set_module_options(native.options("distance/point_boxes.cuh"))
 
 # Part of a distance under which another face is nearer.
 NEARER = wp.constant(wp.float64(0.999))

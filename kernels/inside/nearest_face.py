@@ -7,6 +7,7 @@ of `SearchScale` covers that, a rotation off orthonormal included, along each ax
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.nodes import Node, load_node
 from warp_abtree.kernels.base.poses import PairPose
@@ -64,6 +65,17 @@ def square_outside(node: Node, x: wp.vec3d):
         gap = wp.max(wp.max(wp.float64(node.lower[i]) - x[i], x[i] - wp.float64(node.upper[i])), wp.float64(0.0))
         total += gap * gap
     return wp.where(node.skip < 0, wp.float64(wp.inf), total)
+
+
+@native.func_native()
+def open_node(
+    boxes: wp.array(dtype=wp.vec4),
+    at: wp.int32,
+    x: wp.vec3d,
+    squares: wp.ref[wp.vec2d],
+    codes: wp.ref[wp.vec2i],
+):
+    """Find the squared distances of a point from two siblings' boxes, and what they stand for, ~face of a leaf."""
 
 
 @wp.func
@@ -141,29 +153,29 @@ def nearest_face_within(
     limit = limit * limit
     stack = wp.zeros(shape=(STACK_ROOM,), dtype=wp.int32)
     bound = wp.zeros(shape=(STACK_ROOM,), dtype=wp.float64)
-    stack[0] = 1
-    bound[0] = square_outside(load_node(trees.states, solid.node + 1), x)
+    root = load_node(trees.states, solid.node + 1)
+    stack[0] = wp.where(root.face >= 0, ~root.face, root.skip)
+    bound[0] = square_outside(root, x)
     end = wp.int32(1)
     while end > 0:
         end -= 1
+        below = stack[end]
         # Infinite where nothing is active.
         live = bound[end] <= limit and bound[end] < wp.float64(wp.inf)
-        node = load_node(trees.states, solid.node + stack[end])
-        if live and node.face < 0:
-            first = 2 * node.skip
-            d0 = square_outside(load_node(trees.states, solid.node + first), x)
-            d1 = square_outside(load_node(trees.states, solid.node + first + 1), x)
+        if live and below >= 0:
+            squares, codes = wp.vec2d(), wp.vec2i()
+            open_node(trees.states.node_box, solid.node + 2 * below, x, squares, codes)
             # The nearer one on top.
-            turn = wp.where(d0 < d1, 1, 0)
-            stack[end] = first + turn
-            bound[end] = wp.max(d0, d1)
-            stack[end + 1] = first + 1 - turn
-            bound[end + 1] = wp.min(d0, d1)
+            turn = wp.where(squares[0] < squares[1], 1, 0)
+            stack[end] = codes[turn]
+            bound[end] = squares[turn]
+            stack[end + 1] = codes[1 - turn]
+            bound[end + 1] = squares[1 - turn]
             end += 2
         elif live:
-            d = point_distance(trees, pose, solid, node.face, point)
-            if d < least or (d == least and node.face < face):
-                face = node.face
+            d = point_distance(trees, pose, solid, ~below, point)
+            if d < least or (d == least and ~below < face):
+                face = ~below
                 if d < least:
                     least = d
                     limit = (d + solid.margin) * solid.grow

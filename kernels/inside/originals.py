@@ -16,7 +16,7 @@ from warp_abtree.kernels.inside.nearest_face import make_solid, nearest_face, po
 from warp_abtree.kernels.inside.parity import load_posed_face
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT
 
-wp.set_module_options(native.options())
+wp.set_module_options(native.options("distance/point_boxes.cuh"))
 
 
 @wp.kernel

@@ -23,7 +23,7 @@ from warp_abtree.kernels.intersect.box_tiles import spread_bits
 from warp_abtree.kernels.triangle.distance import largest_coordinate
 from warp_abtree.kernels.triangle.triangle_pair import PAIR_ROUNDING
 
-MODULE_OPTIONS = native.options("exact/determinant.cuh")
+MODULE_OPTIONS = native.options("distance/point_boxes.cuh", "exact/determinant.cuh")
 wp.set_module_options(MODULE_OPTIONS)
 
 # Bits of a Morton code along each axis.
