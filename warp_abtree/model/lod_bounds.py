@@ -44,8 +44,7 @@ class LodBounds:
     """Bounds on the distance of any point of the original surface from the surface after each merge.
 
     Attributes:
-        done: Merges that are bounded.
-        replay: The surface after them, and which faces cover which original triangles.
+        replay: The surface after those that are bounded, and which faces cover which original triangles.
     """
 
     def __init__(self, vertices, faces):
@@ -57,7 +56,7 @@ class LodBounds:
         self._pos = np.zeros((2 * len(vertices), 3))
         self._pos[: len(vertices)] = (vertices - self._centre) / self._scale
         self.replay = _new_replay(self._pos, face_count)
-        self.replay.rings = linked_rings(faces, face_array, 2 * len(vertices))
+        self.replay.rings = linked_rings(face_array, 2 * len(vertices))
         launch(hausdorff_bound.start_replay_kernel, face_count, face_array, self.replay)
         self._covers, rows = triangle_cover.Covers(), triangle_cover.COVERS_AT_ONCE
         self._covers.triangle, self._covers.first = self.replay.queue, self.replay.queue_face

@@ -22,7 +22,7 @@ from warp_abtree.kernels.search.make_slabs import make_slab_kernel
 from warp_abtree.query.broad_phase import BroadPhase, PosedBoxes
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.readout import Readout, readout_kernels
-from warp_abtree.query.request import LIST_MAX, check_capacity, check_pair_room, more_room
+from warp_abtree.query.request import LIST_MAX, PAIRS_MAX, CapacityError, check_capacity, more_room
 from warp_abtree.query.result import Found, Result
 from warp_abtree.query.stage import Array, PairDistance, Rooms, Stage
 from warp_abtree.state.batch import Batch
@@ -145,24 +145,17 @@ class Operator(DeviceMemory):
         """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
         return self.regime.uses_warps(self.device)
 
-    def _asked_arrays(self, rooms: Rooms) -> list[Array]:
-        own = [Array(self.pair_batch, "poses", PairPose, rooms.pairs)]
-        if self.broad_phase is None:
-            own.append(Array(self.pair_batch, "pairs", wp.vec2i, rooms.pairs))
-        for stage in self.stages:
-            own += stage.arrays(rooms)
-        return own
-
     def _make(self, rooms: Rooms) -> list:
         """Return (owner, attribute, new array) of all that other rooms take, before anything is replaced."""
-        check_pair_room(rooms.pairs)
+        if rooms.pairs > PAIRS_MAX:
+            raise CapacityError(f"{rooms.pairs} object pairs at a time, more than 2^26; ask them in parts")
         for stage in self.stages:
             stage.prepare(rooms)
-        made = [
-            (asked.owner, asked.name, asked.make(self.device))
-            for asked in self._asked_arrays(rooms)
-            if not asked.is_in_place()
-        ]
+        asked = [Array(self.pair_batch, "poses", PairPose, rooms.pairs)]
+        if self.broad_phase is None:
+            asked.append(Array(self.pair_batch, "pairs", wp.vec2i, rooms.pairs))
+        asked += [array for stage in self.stages for array in stage.arrays(rooms)]
+        made = [(array.owner, array.name, array.make(self.device)) for array in asked if not array.is_in_place()]
         if self.broad_phase is not None and rooms.pairs != len(self.broad_phase.pairs):
             found = self.broad_phase.make_arrays(rooms.pairs)
             pairs = next(array for _, name, array in found if name == "pairs")
@@ -196,7 +189,8 @@ class Operator(DeviceMemory):
             if has_other_pairs:
                 if self.broad_phase is None:
                     self.readout.write_pairs(self.given)
-                self._fill_distances()
+                for distance in self._distances.values():
+                    distance.fill()
 
     @contextmanager
     def changing(self):
@@ -210,21 +204,20 @@ class Operator(DeviceMemory):
         if self._torn:
             raise RuntimeError("this query was interrupted while its buffers changed; make a new one")
 
-    def _fill_distances(self):
-        for distance in self._distances.values():
-            distance.fill()
-
     def distances_of(self, name: str) -> wp.array:
         """Return the distances of pairs of a name, such as "within", device float64 (pair capacity,)."""
         return self._distances[name].rows
 
-    def ask_pairs(self, pairs, **distances):
-        """Query other pairs from now on, in the room there is if they fit; distances of None stay.
+    def set_pairs(self, pairs, within=None):
+        """Query other pairs from now on, in the room there is if they fit; within None keeps the distances.
 
         Raises:
-            ValueError: Bad pairs or distances, an operator that runs the broad phase, or distances for one made
-                without.
+            ValueError: Bad pairs or distances, a query that runs the broad phase, or distances for one made without.
         """
+        self.ask_pairs(pairs, within=within)
+
+    def ask_pairs(self, pairs, **distances):
+        """Do what `set_pairs` does, with distances by their names; those of None stay."""
         if self.broad_phase is not None:
             raise ValueError("this query takes its pairs from the broad phase")
         check_device(self.device, "giving a query other pairs")
@@ -250,7 +243,8 @@ class Operator(DeviceMemory):
             self.given = pairs
             for name, value in distances.items():
                 self._distances[name].value = value
-            self._fill_distances()
+            for distance in self._distances.values():
+                distance.fill()
 
     def is_asked(self, pairs: np.ndarray, **distances) -> bool:
         """Return whether pairs and distances, checked, None without, are those in place."""
@@ -360,10 +354,7 @@ class Operator(DeviceMemory):
             CapacityError: More pairs or hits than there can be room for.
             RuntimeError: As `launch`; or a graph is being captured.
         """
-        self._grow(self._read_demand, between)
-
-    def _read_demand(self) -> Found:
-        return Found(self.readout.read_totals())
+        self._grow(self.readout.read_demand, between)
 
     def _grow(self, read, between=None, first=None) -> Found:
         """Launch as `grow` and return what `read` finds of the last launch; `first` does both the first time."""
@@ -387,8 +378,8 @@ class Operator(DeviceMemory):
 
     def grow_uncertain(self):
         """Make room for the face pairs that wait, as far as there can be, and launch again until all find it."""
-        first = self._read_demand()
-        if self._grow_uncertain(self._read_demand, first) is not first:
+        first = self.readout.read_demand()
+        if self._grow_uncertain(self.readout.read_demand, first) is not first:
             self.report()
 
     def _grow_uncertain(self, read, found: Found) -> Found:

@@ -19,6 +19,7 @@ from warp_abtree.query.staging import Staging, first_rows, view_memory
 # Rows that are expected come in steps.
 ROWS_STEP = 1024
 FLOAT64_ROW = 1 + COUNTERS.index("float64_tests")
+COLUMN_NAMES = "count", *COUNTERS
 HEADER, COLUMNS = int(kernels.HEADER_WORDS), int(kernels.COUNT_COLUMNS)
 
 
@@ -59,7 +60,6 @@ class Readout:
     def __init__(self, operator: Any):
         self.operator, self.device = proxy(operator), operator.device
         self.packs = operator.regime.packs(self.device)
-        self._views: HostViews | None = None
         self._last_read = 0, 0  # pairs of the last result, and its hits
 
     @cached_property
@@ -72,16 +72,14 @@ class Readout:
         """Return what sorts the hits of a result on the device."""
         return HitSort(self.operator)
 
-    def link(self):
-        """Take note of new arrays."""
-        self._views = None
-
-    @property
+    @cached_property
     def views(self) -> HostViews:
         """Return views of the arrays on the CPU."""
-        if self._views is None:
-            self._views = HostViews(self.operator)
-        return self._views
+        return HostViews(self.operator)
+
+    def link(self):
+        """Take note of new arrays."""
+        vars(self).pop("views", None)
 
     def write_pairs(self, pairs: np.ndarray):
         """Bring given pairs to the operator, which has room for them."""
@@ -128,6 +126,10 @@ class Readout:
             apart, waiting = self._read_count(hits.apart_total), int(views.counts[FLOAT64_ROW].sum())
             uncertain = waiting_demand(operator, apart, waiting)
         return Totals(operator.guard.outcome(), self._pair_count(int(views.pair_count[0])), total, uncertain)
+
+    def read_demand(self) -> Found:
+        """Read `read_totals` alone of what was found. Waits for the device."""
+        return Found(totals=self.read_totals())
 
     @staticmethod
     def _read_count(count) -> int:
@@ -204,7 +206,7 @@ class Readout:
             pairs, end = words[end : end + n].view(np.int32).reshape(n, 2), end + n
         flags = words[end:].view(bool)
         apart = None if operator.near is None else flags[n : 2 * n]
-        found = Found(self._totals(words), pairs, flags[:n], apart, columns[0], dict(zip(COUNTERS, columns[1:])))
+        found = Found(pairs, flags[:n], apart, **dict(zip(COLUMN_NAMES, columns)), totals=self._totals(words))
         self._last_read = n, found.totals.hits
         if rows is not None and found.totals.hits <= len(rows):
             found.faces = rows[: found.totals.hits]
@@ -216,8 +218,8 @@ class Readout:
         n = min(totals.pairs, operator.rooms.pairs)
         pairs = (operator.given if operator.broad_phase is None else views.pairs[:n]).copy()
         apart = None if views.near_hit is None else views.near_hit[:n] == 0
-        count, *tests = views.counts[:, :n].copy()
-        return Found(totals, pairs, views.any_hit[:n] != 0, apart, count, dict(zip(COUNTERS, tests)))
+        columns = views.counts[:, :n].copy()
+        return Found(pairs, views.any_hit[:n] != 0, apart, **dict(zip(COLUMN_NAMES, columns)), totals=totals)
 
     def _keep_pairs(self, n: int) -> Found:
         """Return arrays on the device, parts of a block of their own."""
@@ -235,7 +237,7 @@ class Readout:
         else:
             pairs, flags = part(flags, wp.vec2i), flags + column
         apart = None if operator.near is None else part(flags + n, wp.bool)
-        return Found(totals, pairs, part(flags, wp.bool), apart, words[0], dict(zip(COUNTERS, words[1:])))
+        return Found(pairs, part(flags, wp.bool), apart, **dict(zip(COLUMN_NAMES, words)), totals=totals)
 
     def _block_length(self, n: int) -> int:
         """Return the words of a block of n pairs."""

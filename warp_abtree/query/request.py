@@ -71,25 +71,14 @@ class Buffers:
 
 
 def check_capacity(capacity) -> Buffers:
-    """Return the buffers of a query.
-
-    Args:
-        capacity: `Buffers`, or the hits that there is room for.
-
-    Raises:
-        ValueError: A number that is out of range, or none.
-    """
+    """Return `Buffers` as they are, or of the hits that there is room for; raise ValueError for no number in range."""
     if isinstance(capacity, Buffers):
         return capacity
     return Buffers(None if capacity is None else whole_number(capacity, "capacity", 1, LIST_MAX))
 
 
 def check_request(output: str, precision: str):
-    """Check output, precision and options of a query.
-
-    Raises:
-        ValueError: An unknown output or precision, or an output that another operator finds.
-    """
+    """Raise ValueError for an unknown output or precision, or an output that another operator finds."""
     if output not in (*OUTPUTS, "contacts", "distance"):
         raise ValueError(f"output {output!r} is none of 'any', 'count', 'faces', 'contacts', 'distance'")
     if precision not in _PRECISION_NAMES:
@@ -100,13 +89,9 @@ def check_request(output: str, precision: str):
 
 
 def check_options(taken: dict, output: str, precision: str, options: dict) -> dict:
-    """Return the options of an output that are not None, nor switches that are off.
+    """Return the options of an output that are not None, nor switches that are off; `taken` is one of the tables above.
 
-    Args:
-        taken: One of the tables above.
-
-    Raises:
-        ValueError: An unknown output or precision, or an option that means nothing for this output.
+    Raises ValueError for an unknown output or precision, or an option that means nothing for this output.
     """
     given = {name: value for name, value in options.items() if value is not None}
     given = {name: value for name, value in given.items() if name not in SWITCHES or flag(value, name)}
@@ -123,15 +108,9 @@ def check_options(taken: dict, output: str, precision: str, options: dict) -> di
 
 
 def check_gap(gap, pair_count, object_count: int) -> np.ndarray:
-    """Return gaps [world units] as float64: () or (p,) beside given pairs, () or (n,) for the broad phase.
-
-    Raises:
-        ValueError: As `check_within`.
-    """
-    if pair_count is not None:
-        return check_within(gap, pair_count, "gap")
+    """Return gaps [world units] as `check_within`: () or (p,) beside given pairs, () or (n,) for the broad phase."""
     known = f"pairs of the broad phase: one for all, or one for each of {object_count} objects"
-    return check_within(gap, object_count, "gap", known)
+    return check_within(gap, *((object_count, "gap", known) if pair_count is None else (pair_count, "gap")))
 
 
 def check_within(within, pair_count=None, name="within", known=None) -> np.ndarray:
@@ -151,12 +130,6 @@ def check_within(within, pair_count=None, name="within", known=None) -> np.ndarr
         whose = "" if within.shape == () else f" of {'pair' if known is None else 'object'} {bad[0]}"
         raise ValueError(f"{name}: {within.flat[bad[0]]}{whose} is no finite distance of 0 or more")
     return within
-
-
-def check_pair_room(count: int):
-    """Raise CapacityError for more object pairs than a launch holds."""
-    if count > PAIRS_MAX:
-        raise CapacityError(f"{count} object pairs at a time, more than 2^26; ask them in parts")
 
 
 def refuse_signed(signed: bool, has_solid: bool):

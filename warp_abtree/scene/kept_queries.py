@@ -132,11 +132,10 @@ class KeptQueries:
     def _load(self, stages: list, output: str, with_broad_phase: bool):
         """Load what a first query launches, all at the same time: from the tree states to the answers."""
         scene, output = self._scene, "faces" if output == "contacts" else output
-        if not scene.object_count:
-            return
-        with_states = scene_kernels(scene.device, [model.face_count for model in scene.models], with_broad_phase)
-        with loading(scene.device, [*operator_kernels(scene.device, stages, output), *with_states]):
-            pass
+        if scene.object_count:
+            kernels = scene_kernels(scene.device, [model.face_count for model in scene.models], with_broad_phase)
+            with loading(scene.device, [*operator_kernels(scene.device, stages, output), *kernels]):
+                pass
 
     def _run(self, key: tuple, query: Operator, device: bool) -> Result:
         """Run an operator and keep it for the next time; one that fails, for lack of memory, gives its own back."""

@@ -42,11 +42,7 @@ class DeviceRows:
 
 
 def take_rows(poses, device, what="poses"):
-    """Return poses where they are, or on the host.
-
-    Raises:
-        ValueError: No numbers, or another shape than (p, 7) and (p, 4, 4).
-    """
+    """Return poses where they are, or on the host; raise ValueError for another shape than (p, 7) and (p, 4, 4)."""
     rows = device_rows(poses, device, what)
     if rows is not None:
         return DeviceRows(rows)
@@ -67,11 +63,7 @@ def refuse_row(poses, i, what="poses"):
 
 
 def take_ends(ends, count: int, device):
-    """Return where motions end as `take_rows` does.
-
-    Raises:
-        ValueError: As `take_rows`; or not as many as there are poses.
-    """
+    """Return where motions end as `take_rows` does; raise ValueError for more or fewer than there are poses."""
     rows = take_rows(ends, device, "end_poses")
     if len(rows) != count:
         raise ValueError(f"end_poses: {len(rows)} given for {count} poses")

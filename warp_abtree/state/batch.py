@@ -12,7 +12,7 @@ from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.generation import Generation
-from warp_abtree.state.lod_update import LodUpdate, replace_states, set_object_lods
+from warp_abtree.state.lod_update import LodUpdate, move_objects, replace_states, set_object_lods
 from warp_abtree.state.solids import SolidArrays
 
 
@@ -39,17 +39,11 @@ class Batch(DeviceMemory):
         mean_faces: About how many faces an object has at its LOD, as the host knows it.
     """
 
-    def __init__(
-        self,
-        models: ModelArrays,
-        states: StateArrays,
-        objects: ObjectArrays,
-        object_model,
-        excluded=(),
-        solid=(),
-        removed=(),
-        names=(),
-    ):
+    models: ModelArrays
+    states: StateArrays
+    objects: ObjectArrays
+
+    def __init__(self, models, states, objects, object_model, excluded=(), solid=(), removed=(), names=()):
         self.device = states.device
         self.models, self.states, self.objects = models, states, objects
         self.object_model = np.asarray(object_model)
@@ -127,12 +121,9 @@ class Batch(DeviceMemory):
         with states.change():
             ids = states.reserve(models)
             moves = [(state, int(self.models.lod_max[model]), -1) for state, model in zip(ids, models, strict=True)]
-            update = LodUpdate(self.models, states, moves)
             for state, model in zip(ids, models, strict=True):
                 serving[self.object_model == model] = state
-            staged = self.objects.stage_states(serving, states)
-            update.launch()
-            self.objects.set_states(serving, staged)
+            move_objects(self.models, states, self.objects, moves, serving)
         self._fit_solids()
 
     def set_lods(self, lods) -> LodUpdate:
@@ -218,8 +209,7 @@ class Batch(DeviceMemory):
 def check_pairs(pairs, object_count: int, removed=()) -> np.ndarray:
     """Return object pairs as int32 (p, 2).
 
-    Raises:
-        ValueError: Wrong shape, an index that is no object or of those removed, an object paired with itself.
+    Raises ValueError for a wrong shape, an index that is no object or was removed, an object paired with itself.
     """
     pairs = to_numpy(pairs, "pairs")
     if pairs.shape in ((0,), (0, 2)):

@@ -80,28 +80,19 @@ def check_beyond(beyond, pair_count=None) -> np.ndarray:
 
 
 def check_tolerances(tolerance=0.0, relative=0.0) -> tuple[float, float]:
-    """Return the tolerances of a search."""
-    return check_tolerance(tolerance, "tolerance", math.inf), check_tolerance(relative, "relative", 1.0)
-
-
-def check_tolerance(tolerance, name: str, most: float) -> float:
-    """Return a tolerance.
-
-    Raises:
-        ValueError: No number from 0 up to below the most.
-    """
-    # Plain numbers, as most are, in a tenth of the time.
-    value = tolerance if type(tolerance) is float else to_numpy(tolerance, name)
-    if np.ndim(value) or not 0 <= value < most:
-        raise ValueError(f"{name}: {tolerance!r} is no number of 0 or more, below {most}")
-    return float(value)
+    """Return the tolerances of a search; raise ValueError for no number from 0 up, a relative one below 1."""
+    for name, asked, most in (("tolerance", tolerance, math.inf), ("relative", relative, 1.0)):
+        # Plain numbers, as most are, in a tenth of the time.
+        value = asked if type(asked) is float else to_numpy(asked, name)
+        if np.ndim(value) or not 0 <= value < most:
+            raise ValueError(f"{name}: {asked!r} is no number of 0 or more, below {most}")
+    return float(tolerance), float(relative)
 
 
 def check_distance_options(options: dict) -> tuple[dict, bool, bool]:
     """Return tolerances, whether distances are signed, and whether of originals; of options that are given.
 
-    Raises:
-        ValueError: A bad one, or depths of originals are asked: depths are those of LODs.
+    Raises ValueError for a bad one, or where depths of originals are asked: depths are those of LODs.
     """
     signed, originals = (flag(options.get(name, False), name) for name in ("signed", "originals"))
     if signed and originals:

@@ -26,14 +26,18 @@ class HitStage(Stage):
 
     counts: wp.array
 
-    def __init__(self):
-        self.hits = face_pairs.Hits()
+    def __init__(self, asked: AskedHits | AskedVisits):
+        self.hits, self._asked = face_pairs.Hits(), asked
 
     def attach(self, operator: Operator):
         """Take the operator."""
         super().attach(operator)
         for name in ("total", "uncertain_total", "inexact_total"):
             setattr(self.hits, name, wp.zeros(1, dtype=wp.int32, device=operator.device))
+
+    def kernels(self, device) -> list:
+        """Return the kernels of the traversal."""
+        return traversal_kernels(device, current_regime(), self._asked)
 
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return what has an entry a pair."""
@@ -66,11 +70,10 @@ class IntersectStage(HitStage):
     traversal: Traversal
 
     def __init__(self, output="any", precision="exact", with_gap=False, reads=True, slots=None, resting=None):
-        super().__init__()
-        self._slots = slots if with_gap else None
+        self._slots, self._resting = slots if with_gap else None, resting
         self._is_exact, self._with_gap, self._reads = precision == "exact", with_gap, reads and output == "faces"
         mode = int(face_pairs.GAP if with_gap else PRECISIONS[precision])
-        self._asked, self._resting = AskedHits(mode, int(OUTPUTS[output]), self._slots is not None), resting
+        super().__init__(AskedHits(mode, int(OUTPUTS[output]), self._slots is not None))
 
     def attach(self, operator: Operator):
         """Take the operator, and give it the hits."""
@@ -82,26 +85,19 @@ class IntersectStage(HitStage):
         operator.hits, operator.traversal, operator.lists_hits = self.hits, self.traversal, self._reads
         operator.lists_apart = self._slots is not None
 
-    def kernels(self, device) -> list:
-        """Return the kernels of the traversal."""
-        return traversal_kernels(device, current_regime(), self._asked)
-
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return the arrays of hits, and the lists of face pairs that wait."""
-        waiting = rooms.uncertain if self.operator.uses_warps() else 0
-        if self._slots is not None:
-            waiting = -(-waiting // APART_FOR_UNCERTAIN)
+        apart = rooms.uncertain if self.operator.uses_warps() else 0
+        waiting = apart if self._slots is None else -(-apart // APART_FOR_UNCERTAIN)
         lists = {"face": rooms.hits, "uncertain": waiting, "inexact": waiting if self._is_exact else 0}
-        if self._with_gap:
-            lists["apart"] = rooms.uncertain if self.operator.uses_warps() else 0
+        lists |= {"apart": apart} if self._with_gap else {}
         made = [Array(self.hits, name, wp.vec3i, room) for name, room in lists.items()]
         return [*super().arrays(rooms), *self.traversal.arrays(rooms), *made]
 
     def search(self):
         """Traverse the pairs in place. Launches only."""
         within = self.hits.gap if self._with_gap else self._no_distance
-        if self._resting is not None:
-            within = self._resting.asked
+        within = within if self._resting is None else self._resting.asked
         slots = None
         if self._slots is not None:
             self._slots.start()
@@ -129,13 +125,9 @@ class VisitStage(HitStage):
     within: wp.array
 
     def __init__(self, within, question: Question, own):
-        super().__init__()
+        super().__init__(AskedVisits(question))
         self.distance = PairDistance("within", within, proxy(self), "within")
-        self.question, self._asked, self._own = question, AskedVisits(question), own
-
-    def kernels(self, device) -> list:
-        """Return the kernels of the traversal."""
-        return traversal_kernels(device, current_regime(), self._asked)
+        self.question, self._own = question, own
 
     def boxes(self, boxes):
         """Return boxes that are wider by half of the distance."""
@@ -265,11 +257,3 @@ class Query(Operator):
         check_request(output, precision)
         first = [] if within is None else [ApartStage(within)]
         return [*first, IntersectStage(output, precision), InsideStage()]
-
-    def set_pairs(self, pairs, within=None):
-        """Query other pairs from now on, in the room there is if they fit; within None keeps the distances.
-
-        Raises:
-            ValueError: Bad pairs or distances, a query that runs the broad phase, or distances for one made without.
-        """
-        self.ask_pairs(pairs, within=within)

@@ -45,21 +45,11 @@ TOLERANCE_LEAST = 2.0**-40
 
 
 def check_time_tolerance(tolerance) -> float:
-    """Return a tolerance of times.
-
-    Raises:
-        ValueError: No number from 2^-40 up to below 1.
-    """
+    """Return a tolerance of times; raise ValueError for no number from 2^-40 up to below 1."""
     value = to_numpy(tolerance, "tolerance")
     if value.shape != () or value.dtype.kind not in "iuf" or not TOLERANCE_LEAST <= value < 1:
         raise ValueError(f"tolerance: {tolerance!r} is no number of 2^-40 or more, below 1")
     return float(value)
-
-
-def check_path(screw, linear):
-    """Raise ValueError for two paths at a time, or what is no bool."""
-    if flag(screw, "screw") & flag(linear, "linear"):
-        raise ValueError("screw and linear: objects move on one kind of path")
 
 
 class SweptBoxes:
@@ -236,17 +226,10 @@ class FirstContactQuery(Operator):
         Raises:
             ValueError: A tolerance out of range, or two paths at a time.
         """
-        check_path(screw, linear)
+        if flag(screw, "screw") & flag(linear, "linear"):
+            raise ValueError("screw and linear: objects move on one kind of path")
         motions = FirstContactStage(check_time_tolerance(tolerance), bool(screw), bool(linear))
         return [IntersectStage(), InsideStage(), motions]
-
-    def set_pairs(self, pairs, within=None):
-        """Query other pairs from now on, in the room there is if they fit; there is no within.
-
-        Raises:
-            ValueError: Bad pairs, or a query that runs the broad phase.
-        """
-        self.ask_pairs(pairs, within=within)
 
     def set_end_poses(self, end_poses):
         """Set where each object's motion ends, from the next launch on.
