@@ -11,7 +11,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.build import triangle_cover as cover
 from warp_abtree.kernels.build.vertex_forest import absorb_ring, count_dying, third_corner, third_vertices_live
 
-wp.set_module_options(native.options("build/cover_ring.h", "build/fetch_merge.h"))
+wp.set_module_options(native.options("build/cover_ring.h", "build/fetch_merge.h", "build/one_polygon.h"))
 
 
 # Entries of `Replay.counter`, kept between launches.

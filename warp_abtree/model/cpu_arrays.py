@@ -49,5 +49,5 @@ def make_scratch(candidates, faces, rows):
     scratch, corners = polygon.Scratch(), int(polygon.POLYGON_CORNERS)
     scratch.near, scratch.used = unwritten(candidates), unwritten(faces)
     scratch.stack, scratch.stack_count = unwritten((rows, corners), wp.vec3d), unwritten(rows)
-    scratch.polygon, scratch.clipped = unwritten((corners,), wp.vec3d), unwritten((corners,), wp.vec3d)
+    scratch.polygon = unwritten((corners,), wp.vec3d)
     return scratch

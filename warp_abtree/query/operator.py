@@ -22,7 +22,7 @@ from warp_abtree.kernels.search.make_slabs import make_slab_kernel
 from warp_abtree.query.broad_phase import BroadPhase, PosedBoxes
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.readout import Readout, readout_kernels
-from warp_abtree.query.request import LIST_MAX, PAIRS_MAX, CapacityError, check_capacity, more_room
+from warp_abtree.query.request import LIST_MAX, check_capacity, check_pair_room, more_room
 from warp_abtree.query.result import Found, Result
 from warp_abtree.query.stage import Array, PairDistance, Rooms, Stage
 from warp_abtree.state.batch import Batch
@@ -147,8 +147,7 @@ class Operator(DeviceMemory):
 
     def _make(self, rooms: Rooms) -> list:
         """Return (owner, attribute, new array) of all that other rooms take, before anything is replaced."""
-        if rooms.pairs > PAIRS_MAX:
-            raise CapacityError(f"{rooms.pairs} object pairs at a time, more than 2^26; ask them in parts")
+        check_pair_room(rooms.pairs)
         for stage in self.stages:
             stage.prepare(rooms)
         asked = [Array(self.pair_batch, "poses", PairPose, rooms.pairs)]
@@ -165,8 +164,7 @@ class Operator(DeviceMemory):
     def make_room(self, pairs: int | None = None, hits: int | None = None, uncertain: int | None = None):
         """Make room for other numbers of entries, None for those of before: for all, or nothing changes.
 
-        Raises:
-            CapacityError: More than there can be room for.
+        Raises CapacityError for more than there can be room for.
         """
         asked = zip((pairs, hits, uncertain), self.rooms, strict=True)
         rooms = Rooms(*(now if wanted is None else wanted for wanted, now in asked))
@@ -255,10 +253,7 @@ class Operator(DeviceMemory):
         return same
 
     def launch(self, between=None):
-        """Run broad phase (unless pairs were given) and narrow phase. Launches only.
-
-        Args:
-            between: Called between the two, as to time them.
+        """Run broad phase (unless pairs were given), `between`, as to time them, and narrow phase. Launches only.
 
         Raises:
             RuntimeError: The scene's objects changed since the query was made, or its filter where the broad phase
@@ -328,10 +323,7 @@ class Operator(DeviceMemory):
         self.launch_kernel(kernel, count * self.lanes, inputs, WARP_SIZE)
 
     def result(self, device: bool = False) -> Result:
-        """Return the results of the last launch, sorted. Waits for the device.
-
-        Args:
-            device: Whether the arrays stay on the device, as Warp arrays that no later launch changes.
+        """Return the results of the last launch, sorted; on the device, as arrays that no later launch changes. Waits.
 
         Raises:
             RuntimeError: There are none: nothing was launched, a launch was interrupted, or it was the replay of a

@@ -102,11 +102,7 @@ class Readout:
             return self.make_result(self.read_pairs(device), device, with_rows)
 
     def make_result(self, found: Any, device: bool, with_rows: bool = True) -> Result:
-        """Check that there was a launch, and read what the stages have found.
-
-        Raises:
-            RuntimeError: As `Operator.result`.
-        """
+        """Check that there was a launch, as `Operator.result` does, and read what the stages have found."""
         operator = self.operator
         if operator.rooms.pairs:  # without room for pairs there are no launches
             operator.guard.check(found.totals.launched)
@@ -119,36 +115,25 @@ class Readout:
         operator = self.operator
         if self.packs:
             return self._totals(self.staging.fetch_words(self._pack_pairs(0), HEADER))
-        views, hits, total, uncertain = self.views, operator.hits, 0, 0
-        if operator.output == "faces":
-            total = max(int(views.counts[0].sum()), self._read_count(hits.witness_total))
-        if operator.rooms.uncertain:
-            apart, waiting = self._read_count(hits.apart_total), int(views.counts[FLOAT64_ROW].sum())
-            uncertain = waiting_demand(operator, apart, waiting)
-        return Totals(operator.guard.outcome(), self._pair_count(int(views.pair_count[0])), total, uncertain)
+        views, hits = self.views, operator.hits
+        total = int(views.counts[0].sum()) if operator.output == "faces" else 0
+        waiting = int(views.counts[FLOAT64_ROW].sum()) if operator.rooms.uncertain else 0
+        # Counters that overflowed are read as uint32.
+        counters = (hits.apart_total, hits.witness_total)
+        read = (0 if count is None else int(count.numpy().view(np.uint32)[0]) for count in counters)
+        return self._totals([operator.guard.outcome(), int(views.pair_count[0]), total, waiting, *read])
 
     def read_demand(self) -> Found:
         """Read `read_totals` alone of what was found. Waits for the device."""
         return Found(totals=self.read_totals())
 
-    @staticmethod
-    def _read_count(count) -> int:
-        """Return a counter of the CPU, read as uint32; 0 where there is none."""
-        return 0 if count is None else int(count.numpy().view(np.uint32)[0])
-
-    def _pair_count(self, found: int) -> int:
-        """Return how many pairs there are, of which so many were read on the device."""
-        operator = self.operator
-        return len(operator.given) if operator.broad_phase is None else operator.broad_phase.check_found(found)
-
-    def _totals(self, words) -> Totals:
+    def _totals(self, header) -> Totals:
         """Return the demands in a header; those of lists that the operator lacks are 0."""
-        launched, found, total, uncertain, apart, witnesses = words[:HEADER].tolist()
-        total = max(total, witnesses)
+        launched, found, total, uncertain, apart, witnesses = map(int, header[:HEADER])
         operator = self.operator
-        listed, waits = operator.output == "faces", operator.rooms.uncertain
-        demand = waiting_demand(operator, apart, uncertain) if waits else 0
-        return Totals(launched, self._pair_count(found), total if listed else 0, demand)
+        pairs = len(operator.given) if operator.broad_phase is None else operator.broad_phase.check_found(found)
+        demand = waiting_demand(operator, apart, uncertain) if operator.rooms.uncertain else 0
+        return Totals(launched, pairs, max(total, witnesses) if operator.output == "faces" else 0, demand)
 
     def read_pairs(self, device: bool) -> Found:
         """Read demands, and what there is an entry a pair of. Waits for the device."""
@@ -180,10 +165,7 @@ class Readout:
         return self._bring(n, self._sort_expected(n))
 
     def _sort_expected(self, n: int) -> int:
-        """Sort as many hits as the last result of so many pairs makes likely, and return how many.
-
-        So the device sorts them while the host still launches, and a loop over poses waits once a call.
-        """
+        """Sort as many hits as are likely after the last result, while the host still launches; return how many."""
         pairs, hits = self._last_read
         if not self.operator.lists_hits or pairs != n or hits == 0:
             return 0
@@ -276,8 +258,7 @@ class Readout:
 
     def _sort_hits(self, count: int, rows: Any = None):
         """Write the first hits in order to rows, by default to the staging memory, and return these. Launches only."""
-        if rows is None:
-            rows = self.staging.room("rows", count, wp.vec3i)
+        rows = self.staging.room("rows", count, wp.vec3i) if rows is None else rows
         order = self.staging.room("order", 2 * count, wp.int32)
         key = self.staging.room("key", 2 * count, wp.int64)
         self.sort.launch(count, order, key, rows, self.staging)

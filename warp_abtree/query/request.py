@@ -132,6 +132,12 @@ def check_within(within, pair_count=None, name="within", known=None) -> np.ndarr
     return within
 
 
+def check_pair_room(count: int):
+    """Raise CapacityError for more object pairs than a launch holds."""
+    if count > PAIRS_MAX:
+        raise CapacityError(f"{count} object pairs at a time, more than 2^26; ask them in parts")
+
+
 def refuse_signed(signed: bool, has_solid: bool):
     """Raise ValueError where depths are asked of surfaces alone: all would be 0."""
     if signed and not has_solid:

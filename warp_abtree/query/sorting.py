@@ -53,11 +53,9 @@ def first_sort(device) -> list:
 
 
 def segment_threads(count: int, pair_room: int, chosen: bool | None) -> int:
-    """Return the threads of a group that sorts the hits of one pair on CUDA, 0 for a radix sort of them all.
+    """Return the threads of a group that sorts the hits of one pair, `count` in all; 0 for a radix sort of them all.
 
-    Args:
-        count: Hits that are sorted, at most.
-        chosen: `Regime.segments`; None: there are few hits a pair on average.
+    `chosen` is `Regime.segments`; None: there are few hits a pair on average.
     """
     mean, thread_max = count / pair_room, sort_segments.SEGMENT_THREADS
     if chosen is None:
@@ -142,10 +140,7 @@ class HitSort:
         return False
 
     def _make_radix(self, count, passes, order, key, rows, ends, launch) -> list:
-        """Return what `launch` makes of the kernels that make the keys of each pass, and of the last, that places rows.
-
-        One call of Warp's sort lies behind each pass.
-        """
+        """Make the launches of keys, behind each of which a sort lies, and of the kernel that places rows."""
         start, totals, _ = ends
         hits, device, made = self.operator.hits, self.operator.device, []
         for number, widths in enumerate(passes):

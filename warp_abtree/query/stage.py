@@ -102,12 +102,9 @@ class PairDistance:
 
     Args:
         name: What errors call it.
-        value: As asked.
+        value: The distances, as asked, from `check` on NumPy () or (p,); None where kernels write them.
         owner, attribute: What holds the device array of distances, float64 (pair,).
         check: Returns a value, checked, for a number of pairs, None for those of the broad phase.
-
-    Attributes:
-        value: The distances, NumPy () or (p,); None where kernels write them.
     """
 
     def __init__(self, name: str, value, owner, attribute: str, check=check_within):

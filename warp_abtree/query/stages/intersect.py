@@ -17,12 +17,7 @@ from warp_abtree.query.stages.traversal import AskedHits, AskedVisits, Traversal
 
 
 class HitStage(Stage):
-    """A stage that counts hits of each pair.
-
-    Attributes:
-        hits: Device arrays of the last launch, `kernels.intersect.face_pairs.Hits`.
-        counts: Its counters, device int64; rows: hits, then what `COUNTERS` names.
-    """
+    """A stage that counts hits of each pair: `hits`, and `counts`, rows of its counters, as `Operator` has them."""
 
     counts: wp.array
 
@@ -113,13 +108,9 @@ class IntersectStage(HitStage):
 class VisitStage(HitStage):
     """Visit the face pairs of each pair that are not proved farther apart than a distance.
 
-    Args:
-        within: Distances [world units], see `PairDistance`.
-        question: What visits ask.
-        own: What they are given.
-
     Attributes:
-        within: The distances, device float64 (pair,).
+        within: Distances [world units], see `PairDistance`, device float64 (pair,).
+        question: What visits ask, of what they are given: `own`.
     """
 
     within: wp.array
@@ -144,11 +135,7 @@ class VisitStage(HitStage):
 
 
 class ApartStage(VisitStage):
-    """Find the pairs that are not proved farther apart than a distance.
-
-    Attributes:
-        hits: any_hit is 0 where a pair is proved apart.
-    """
+    """Find the pairs that are not proved farther apart than a distance: their any_hit is not 0."""
 
     def __init__(self, within):
         super().__init__(within, PROVED_APART, 0)
@@ -160,22 +147,14 @@ class ApartStage(VisitStage):
 
 
 class GapStage(Stage):
-    """Distances within which faces of a pair count as near: given, or the sum of what each of its objects has.
-
-    Args:
-        gap: As for `ContactQuery`.
-    """
+    """Distances within which faces of a pair count as near: given, or the sum of what each of its objects has."""
 
     def __init__(self, gap):
         self._gap, self._hits = gap, face_pairs.Hits()
         self._reach: wp.array | None = None  # part of each object, where the broad phase makes pairs
 
     def give_to(self, hits, precision: str):
-        """Let hits have the gap of each pair.
-
-        Raises:
-            ValueError: Another precision than "exact".
-        """
+        """Let hits have the gap of each pair; raise ValueError for another precision than "exact"."""
         if precision != "exact":
             raise ValueError(f"gap: needs precision 'exact', not {precision!r}")
         self._hits = hits
@@ -249,11 +228,7 @@ class Query(Operator):
 
     @staticmethod
     def plan(output="faces", precision="exact", within=None) -> list[Stage]:
-        """Return the stages of a query.
-
-        Raises:
-            ValueError: An unknown output or precision.
-        """
+        """Return the stages of a query; raise ValueError for an unknown output or precision."""
         check_request(output, precision)
         first = [] if within is None else [ApartStage(within)]
         return [*first, IntersectStage(output, precision), InsideStage()]

@@ -161,20 +161,14 @@ class FirstContactStage(Stage):
         return [launch(group.warp_motion_search(self._kind), inputs=inputs, **threads)]
 
     def read(self, found: Found, device: bool, with_rows: bool):
-        """Read times and how motions end.
-
-        Raises:
-            ValueError: An object turns by half a revolution, which has no shortest way.
-        """
+        """Read times and how motions end; raise ValueError where an object turns by half a revolution."""
         n = len(found.pairs)
         ends = first_rows(self.contacts.end, n).numpy() if n else np.empty(0, np.int32)
         half = np.flatnonzero(ends == int(start.HALF_TURN))
         if len(half):
-            pairs = found.pairs.numpy() if device else found.pairs
-            raise ValueError(
-                f"end_poses: one of objects {pairs[half[0]].tolist()} turns by half a revolution, which has no "
-                "shortest way; split its motion in two"
-            )
+            pair = (found.pairs.numpy() if device else found.pairs)[half[0]].tolist()
+            why = "turns by half a revolution, which has no shortest way; split its motion in two"
+            raise ValueError(f"end_poses: one of objects {pair} {why}")
         found.time = wp.clone(first_rows(self.contacts.time, n))
         found.clear, found.undecided = ends == int(face_pair.CLEAR), ends == int(face_pair.UNDECIDED)
         if not device:
@@ -221,24 +215,16 @@ class FirstContactQuery(Operator):
 
     @staticmethod
     def plan(tolerance=1e-6, screw=False, linear=False) -> list[Stage]:
-        """Return the stages of a query.
-
-        Raises:
-            ValueError: A tolerance out of range, or two paths at a time.
-        """
+        """Return the stages of a query; raise ValueError for a tolerance out of range, or two paths at a time."""
         if flag(screw, "screw") & flag(linear, "linear"):
             raise ValueError("screw and linear: objects move on one kind of path")
         motions = FirstContactStage(check_time_tolerance(tolerance), bool(screw), bool(linear))
         return [IntersectStage(), InsideStage(), motions]
 
     def set_end_poses(self, end_poses):
-        """Set where each object's motion ends, from the next launch on.
+        """Set where each object's motion ends, from the next launch on. (synchronization point)
 
-        Args:
-            end_poses: Of all objects, as for `Scene.set_poses`. (synchronization point)
-
-        Raises:
-            ValueError: As `Scene.set_poses`; nothing is changed.
+        Takes the poses of all objects, and raises ValueError, as `Scene.set_poses`; nothing is changed then.
         """
         check_device(self.device, "giving a query end poses")
         self._end_setter.set(end_poses)

@@ -19,12 +19,7 @@ def make_finest(batch: Batch) -> Batch:
 
 
 class Originals:
-    """The objects of a batch at their finest LODs, as they are posed, with tree states that are made once.
-
-    Attributes:
-        batch: `Batch` of its own.
-        broad_phase: Of these; originals may lie out of the boxes of their LODs.
-    """
+    """`make_finest` of a batch, and their broad phase: originals may lie out of the boxes of their LODs."""
 
     def __init__(self, batch: Batch):
         self._of, self.batch = batch, make_finest(batch)
@@ -38,13 +33,9 @@ class Originals:
 
 
 class OriginalStage(Stage):
-    """Move contact points found at LODs to the original surfaces.
+    """Move contact points found at LODs to the original surfaces."""
 
-    Attributes:
-        poses: Of the originals of each pair, device `PairPose` (pair,).
-    """
-
-    poses: Any
+    poses: Any  # of the originals of each pair, device `PairPose` (pair,)
 
     def attach(self, operator: Operator):
         """Take the operator, and make the tree states."""
