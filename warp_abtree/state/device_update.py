@@ -9,14 +9,7 @@ from warp_abtree.kernels.update import levels as level_kernels
 from warp_abtree.kernels.update import work_lists
 from warp_abtree.state.arrays import ModelArrays, StateArrays
 from warp_abtree.state.batch import Batch
-from warp_abtree.state.work_lists import (
-    WorkLists,
-    active_update,
-    block_limits,
-    make_level_lists,
-    partial_limit,
-    refine_meshes,
-)
+from warp_abtree.state.work_lists import WorkLists, block_limits, make_level_lists, partial_limit
 
 # LODs wanted on the device that are out of range, and the lowest index that had one.
 NO_FAULTS = (0, 2**31 - 1)
@@ -96,9 +89,7 @@ class DeviceLodUpdate(WorkLists):
         wp.launch(work_lists.clear_plan_kernel, max(count, int(LEVEL_MAX)), [self.plan], device=self.device)
         inputs = [self.models.pool, self.splits, self.wanted, self.states.pool, self.plan, self.faults]
         wp.launch(work_lists.plan_update_kernel, count, inputs, device=self.device)
-        self.update_by_blocks(self.models.pool, self.states.pool)
-        refine_meshes(self.models.pool, self.states.pool, self)
-        active_update(self.models.pool, self.states.pool, self)
+        self.update(self.models.pool, self.states.pool)
 
 
 def shares_levels(object_model, levels) -> np.ndarray:

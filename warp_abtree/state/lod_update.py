@@ -11,14 +11,7 @@ from warp_abtree.kernels.base.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import refit
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
 from warp_abtree.state.arrays import NO_CORNERS, ModelArrays, ObjectArrays, StateArrays
-from warp_abtree.state.work_lists import (
-    WorkLists,
-    active_update,
-    block_limits,
-    make_level_lists,
-    partial_limit,
-    refine_meshes,
-)
+from warp_abtree.state.work_lists import WorkLists, block_limits, make_level_lists, partial_limit
 
 
 def choose_states(states: StateArrays, wanted: set, used: set) -> tuple[list, dict]:
@@ -194,9 +187,7 @@ class LodUpdate(WorkLists):
 
     def relaunch(self):
         """Refine meshes and update trees from the LODs that stand there. Launches only."""
-        self.update_by_blocks(self.models.pool, self.states.pool)
-        refine_meshes(self.models.pool, self.states.pool, self)
-        active_update(self.models.pool, self.states.pool, self)
+        self.update(self.models.pool, self.states.pool)
 
 
 def move_objects(models: ModelArrays, states: StateArrays, objects: ObjectArrays, moves, serving) -> LodUpdate:

@@ -102,10 +102,14 @@ class WorkLists(DeviceMemory):
         words = 1 if self.device.is_cuda else int(block_update.MARK_WORDS)
         self._scratch = wp.empty(words, dtype=wp.uint32, device=self.device)
 
-    def update_by_blocks(self, models, states):
-        """Refine meshes and update trees of the states that a block takes each. One launch."""
-        if not self.block_room:
-            return
+    def update(self, models, states):
+        """Refine meshes and update trees of `ModelPool` and `StatePool`, by blocks and by lists. Launches only."""
+        if self.block_room:
+            self._update_by_blocks(models, states)
+        refine_meshes(models, states, self)
+        active_update(models, states, self)
+
+    def _update_by_blocks(self, models, states):
         blocks, threads, shallow = 1, 1, False
         if self.device.is_cuda:
             shallow = self.depth <= block_update.SHALLOW_DEPTH and self.block_room > self.device.sm_count
