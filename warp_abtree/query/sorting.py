@@ -102,11 +102,10 @@ class HitSort:
         self._none = tuple(wp.empty(0, dtype=dtype, device=operator.device) for dtype in (wp.int32, wp.int32, wp.vec3i))
 
     def launch(self, count: int, order, key, rows, staging=None, ends=None) -> bool:
-        """Write the first hits to rows in order; return whether by segments. Launches only.
+        """Write the first hits to rows, device vec3i (count,), in order; return whether by segments. Launches only.
 
         Args:
             order, key: Scratch, device int32 and int64 (2 count,); the keys of the last pass stay.
-            rows: Device vec3i (count,).
             staging: Where there is room for the starts of pairs, if no ends are asked.
             ends: What else is written: where the hits of each pair start, device int32 (pair room + 1,); zeros for
                 int32 (2,); and `ChunkSums.span`, vec3i, by segments alone.

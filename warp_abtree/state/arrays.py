@@ -25,7 +25,6 @@ class ModelArrays(DeviceMemory):
 
     Attributes:
         pool: `ModelPool` for kernels.
-        device: As given.
         vertex_start, face_start, split_start, node_count, face_count, depth: NumPy, one entry a model.
         split_bounds: split_start of each model, offset into the pool's split_face.
         size: Longest side of each model's box [model units].

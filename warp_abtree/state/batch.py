@@ -23,8 +23,7 @@ class Batch(DeviceMemory):
     their own, on the same models.
 
     Args:
-        models, states: Arrays of one device.
-        objects: Arrays of the same device.
+        models, states, objects: Arrays of one device.
         object_model: Model of each object, int (n,).
         excluded: Keys of pairs that the broad phase leaves out, see `exclusion_keys`.
         solid: Whether each object is a solid, (n,); empty for none.
@@ -32,7 +31,6 @@ class Batch(DeviceMemory):
         names: Of the objects, or none.
 
     Attributes:
-        models, states, objects, object_model, excluded, removed, names: As given.
         solids: `SolidArrays`, None where no object is a solid.
         device: Of the arrays.
         filter_generation: `Generation` of the excluded pairs.

@@ -18,12 +18,8 @@ NO_FAULTS = (0, 2**31 - 1)
 class DeviceLodUpdate(WorkLists):
     """Bring every state of a pool to LODs that stand on the device, planned there: allocates once, launches many.
 
-    The worklists have room for the worst case: every state moves, by the longest slice that is not refitted whole.
-    From the first launch on, LODs of states are known on the device only (`StatePool.lod`).
-
-    Args:
-        models, states: A pool that grows no more.
-        moving: Ids of the states that may be brought to other LODs; None is all.
+    The worklists have room for the worst case: every state of a pool that grows no more moves, or those of some ids, by
+    the longest slice that is not refitted whole. From the first launch on, LODs are known on the device only.
 
     Attributes:
         wanted: LOD of each state, device int32 (s,), to be written before a launch.
@@ -95,9 +91,7 @@ class DeviceLodUpdate(WorkLists):
 def shares_levels(object_model, levels) -> np.ndarray:
     """Return of each model whether its objects share tree states, one a level: where there are fewer levels than them.
 
-    Args:
-        object_model: Model of each object, int (n,).
-        levels: LODs of each model, a list of arrays.
+    `object_model` has the model of each object, int (n,), `levels` the LODs of each model, a list of arrays.
     """
     lengths = np.array([len(part) for part in levels])
     return np.bincount(object_model, minlength=len(lengths)) > lengths
@@ -124,9 +118,6 @@ class LevelStates:
         levels: `kernels.update.levels.Levels`.
         level_model, level_lod: Model and LOD of each level, int arrays.
         plan: `UpdateLists` of states that are updated; None where there are none.
-
-    Raises:
-        ValueError: The pool would pass 2^30 nodes.
     """
 
     def __init__(self, batch: Batch, levels, lods, shared=None):

@@ -106,25 +106,21 @@ class DistanceStage(Stage):
     """Find the distances of the pairs that do not intersect, and points of those that do.
 
     Args:
-        beyond: Distances that end the search of a pair, as `check_beyond` returns them.
-        tolerances: As `check_tolerances` returns them.
+        beyond, tolerances: When the search of a pair ends, as `check_beyond` and `check_tolerances` return them.
         signed: Whether pairs have depths.
         inside: `InsideStage`, the stage before; None for surfaces alone.
         with_points: Whether pairs that intersect have points.
-
-    Attributes:
-        distances: As of `DistanceQuery`.
-        found: What the search keeps of each pair, `frame.NearestFound`.
     """
 
     memory: wp.array  # of each thread of the CPU
+    asked_tolerances: tuple = ()
 
     def __init__(
         self, beyond, tolerances=(0.0, 0.0), signed=False, inside: InsideStage | None = None, with_points=True
     ):
-        self.asked_tolerances, self._signed, self._inside, self._with_points = tolerances, signed, inside, with_points
+        self._signed, self._inside, self._with_points = signed, inside, with_points
         self._tolerances = frame.Tolerances()
-        self._tolerances.tolerance, self._tolerances.relative = tolerances
+        self.take_tolerances(tolerances)
         self.distances, self.found, self.slabs = report.Distances(), frame.NearestFound(), mean_slabs.Slabs()
         self.distance = PairDistance("beyond", beyond, self.found, "beyond", check_beyond)
         self._views: dict = {}
@@ -201,9 +197,8 @@ class DistanceStage(Stage):
             operator.launch_all("distances", self._make_distances)
         else:
             cores = self._cores()
-            *first, last = operator.commands.find(
-                "distances", (cores == 1, *operator.guard.given()), self._make_distances
-            )
+            given = cores == 1, *operator.guard.given()
+            *first, last = operator.commands.find("distances", given, self._make_distances)
             for command in first:
                 command.launch()
             launch_on_cores(last.launch, cores)

@@ -51,15 +51,11 @@ class IntersectStage(HitStage):
     """Find the faces of each pair that intersect, and with a gap those that are nearer than it.
 
     Args:
-        output: "any", "count" or "faces".
-        precision: As for `Query`.
+        output, precision: As for `Query`.
         with_gap: Whether the hits have gaps.
-        slots: `SlotStage` that reduces what is apart, or None where it is reported.
         reads: Whether results have the hits as rows.
+        slots: `SlotStage` that reduces what is apart, or None where it is reported.
         resting: `MemoryStage` of pairs that are passed over, or None.
-
-    Attributes:
-        traversal: `Traversal`, which other stages share.
     """
 
     traversal: Traversal

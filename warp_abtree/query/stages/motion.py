@@ -26,6 +26,7 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, flag, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.checks.regime import current_regime
+from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.motion import face_pair, group, path, search, start
@@ -72,15 +73,10 @@ class SweptBoxes:
 class FirstContactStage(Stage):
     """Find when the pairs first touch that do not intersect at first.
 
-    Args:
-        tolerance, screw, linear: As for `FirstContactQuery`, checked.
-
-    Attributes:
-        ends, contacts: As of `FirstContactQuery`.
-        motion: Motion of each pair, device `path.Motion` or `linear.LinearMotion` (pair,).
+    Arguments and attributes are those of `FirstContactQuery`, checked.
     """
 
-    motion: wp.array
+    motion: wp.array  # of each pair, device `path.Motion` or `linear.LinearMotion` (pair,)
     memory: wp.array  # of each thread of the CPU
 
     def __init__(self, tolerance=1e-6, screw=False, linear=False):
@@ -94,11 +90,7 @@ class FirstContactStage(Stage):
         device, batch, placed = operator.device, operator.batch, operator.batch.objects.pool
         self.contacts.counter = wp.zeros(CONTACT_COUNTERS, dtype=wp.int32, device=device)
         self.ends.rotation, self.ends.position = wp.clone(placed.rotation), wp.clone(placed.position)
-        paths = path.Paths()
-        for name in ("axis", "angle", "anchor", "start", "travel"):
-            dtype = wp.float64 if name == "angle" else wp.vec3d
-            setattr(paths, name, wp.zeros(batch.object_count, dtype=dtype, device=device))
-        self._motions.paths, self._motions.ends = paths, self.ends
+        self._motions.paths, self._motions.ends = zeros_of(path.Paths, batch.object_count, 0, device), self.ends
 
     def kernels(self, device) -> list:
         """Return what makes motions and follows them."""
@@ -169,14 +161,12 @@ class FirstContactStage(Stage):
             pair = (found.pairs.numpy() if device else found.pairs)[half[0]].tolist()
             why = "turns by half a revolution, which has no shortest way; split its motion in two"
             raise ValueError(f"end_poses: one of objects {pair} {why}")
-        found.time = wp.clone(first_rows(self.contacts.time, n))
-        found.clear, found.undecided = ends == int(face_pair.CLEAR), ends == int(face_pair.UNDECIDED)
-        if not device:
-            found.time = found.time.numpy()
-            return
-        found.clear, found.undecided = (
-            wp.array(answers, dtype=wp.bool, device=self.operator.device) for answers in (found.clear, found.undecided)
-        )
+        time = wp.clone(first_rows(self.contacts.time, n))
+        found.time = time if device else time.numpy()
+        for name, end in (("clear", face_pair.CLEAR), ("undecided", face_pair.UNDECIDED)):
+            answers = ends == int(end)
+            answers = wp.array(answers, dtype=wp.bool, device=self.operator.device) if device else answers
+            setattr(found, name, answers)
 
 
 class FirstContactQuery(Operator):
