@@ -76,10 +76,13 @@ class _PosedBoxes:
 
     def __init__(self, batch: Batch):
         batch.catch_up()
-        self.rotation, self.position = (a.numpy() for a in (batch.objects.pool.rotation, batch.objects.pool.position))
-        states, box = batch.states, np.zeros((len(batch.states.slots), 2, 3))
-        used, state = np.unique(batch.objects.state), batch.objects.state
-        for i in used:
+        pool, state, states = batch.objects.pool, batch.objects.state, batch.states
+        self.rotation, self.position, box = (
+            pool.rotation.numpy(),
+            pool.position.numpy(),
+            np.zeros((len(states.slots), 2, 3)),
+        )
+        for i in np.unique(state):
             box[i] = [corners[1] for corners in states.read_nodes(states.slots[i], 2)[:2]]
         self.half = (box[:, 1] - box[:, 0])[state] / 2
         middle = batch.models.pool.centre.numpy()[batch.object_model] + box.mean(1)[state]

@@ -13,6 +13,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, flag, to_numpy, whole_number
 from warp_abtree.checks.radix_sort import radix_sort
+from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.inside import point_distance as kernels
 from warp_abtree.model.mesh import COORDINATE_MAX
 from warp_abtree.model.model import Model
@@ -25,7 +26,6 @@ from warp_abtree.scene.posed_objects import PosedObjects
 RUNS = {"cpu": 256, "cuda": 1}
 # Models whose device arrays are kept for the next call.
 KEPT_MODELS = 4
-OUTPUTS = {"distance": wp.float64, "object": wp.int32, "nearest": wp.vec3d, "face": wp.int32}
 
 _kept: dict[tuple, tuple] = {}
 
@@ -90,16 +90,14 @@ def _measure(scene, asked, points, within) -> tuple:
     """Return the outputs of points from objects of a scene, rows of (object, whether it has an inside)."""
     most = np.inf if within is None else float(check_within(within, known="points: one distance for all"))
     batch, n, device = scene.batch(), len(points), scene.device
-    found = kernels.PointDistances()
-    for name, dtype in OUTPUTS.items():
-        setattr(found, name, wp.empty(n, dtype=dtype, device=device))
+    found = zeros_of(kernels.PointDistances, n, 0, device)
     if n:
         rows = wp.array(points, dtype=wp.vec3d, device=device)
         run = RUNS["cpu" if device.is_cpu else "cuda"]
         asked = wp.array(np.asarray(asked, np.int32), dtype=wp.vec2i, device=device)
         inputs = [run, wp.float64(most), batch.trees, asked, rows, _sort(points, rows), found]
         wp.launch(kernels.measure_point_kernel, -(-n // run), inputs, device=device, block_dim=64)
-    return tuple(getattr(found, name).numpy() for name in OUTPUTS)
+    return tuple(getattr(found, name).numpy() for name in ("distance", "object", "nearest", "face"))
 
 
 def _check_points(points) -> np.ndarray:
@@ -109,12 +107,12 @@ def _check_points(points) -> np.ndarray:
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "iuf":
         raise ValueError(f"points: shape {points.shape} and type {points.dtype}, not numbers of shape (n, 3)")
     points = points.astype(np.float64, order="C")
-    sound = np.isfinite(points).all(1)
-    if not sound.all():
-        raise ValueError(f"points: point {sound.argmin()} is not finite")
-    near = (np.abs(points) <= COORDINATE_MAX).all(1)
-    if not near.all():
-        raise ValueError(f"points: point {near.argmin()} has a coordinate beyond 2^300, the most that a mesh may have")
+    for sound, fault in (
+        (np.isfinite(points), "is not finite"),
+        (np.abs(points) <= COORDINATE_MAX, "has a coordinate beyond 2^300, the most that a mesh may have"),
+    ):
+        if not sound.all():
+            raise ValueError(f"points: point {sound.all(1).argmin()} {fault}")
     return points
 
 

@@ -20,7 +20,7 @@ from warp_abtree.query.stages.distance import DistanceQuery, check_beyond, check
 from warp_abtree.query.stages.intersect import Query
 from warp_abtree.query.stages.motion import FirstContactQuery
 from warp_abtree.scene.scene import Scene
-from warp_abtree.scene.sweep_poses import DeviceRows, PoseSlot, find_copy_stream, refuse_row, take_ends, take_rows
+from warp_abtree.scene.sweep_poses import DeviceRows, PoseSlot, find_copy_stream, refuse_row, take_rows
 from warp_abtree.state.arrays import ObjectArrays
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
@@ -298,7 +298,9 @@ def sweep(
     with device_lock(pair.device):
         poses = take_rows(poses, pair.device)
         if output == "first_contact":
-            options["end_poses"] = take_ends(options["end_poses"], len(poses), pair.device)
+            options["end_poses"] = ends = take_rows(options["end_poses"], pair.device, "end_poses")
+            if len(ends) != len(poses):
+                raise ValueError(f"end_poses: {len(ends)} given for {len(poses)} poses")
         for i, (model, lod) in enumerate([(model_a, lod_a), (model_b, lod_b)]):
             pair.add(model, lod=lod, solid=solid[i] if isinstance(solid, tuple | list) and len(solid) == 2 else solid)
         refuse_signed(options.get("signed", False), any(pair.object_solid))

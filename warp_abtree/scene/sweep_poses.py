@@ -62,14 +62,6 @@ def refuse_row(poses, i, what="poses"):
     raise ValueError(f"{what}: pose {i} is no pose")  # by rounding, where the host finds it just within
 
 
-def take_ends(ends, count: int, device):
-    """Return where motions end as `take_rows` does; raise ValueError for more or fewer than there are poses."""
-    rows = take_rows(ends, device, "end_poses")
-    if len(rows) != count:
-        raise ValueError(f"end_poses: {len(rows)} given for {count} poses")
-    return rows
-
-
 @functools.cache
 def find_copy_stream(alias):
     """Return a device's stream for transfers, one for all: Warp makes and ends streams on one thread at a time."""

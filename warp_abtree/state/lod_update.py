@@ -10,7 +10,7 @@ from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.base.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import refit
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
-from warp_abtree.state.arrays import NO_CORNERS, ModelArrays, ObjectArrays, StateArrays
+from warp_abtree.state.arrays import NO_CORNERS, ModelArrays, StateArrays
 from warp_abtree.state.work_lists import WorkLists, block_limits, make_level_lists, partial_limit
 
 
@@ -188,50 +188,3 @@ class LodUpdate(WorkLists):
     def relaunch(self):
         """Refine meshes and update trees from the LODs that stand there. Launches only."""
         self.update(self.models.pool, self.states.pool)
-
-
-def move_objects(models: ModelArrays, states: StateArrays, objects: ObjectArrays, moves, serving) -> LodUpdate:
-    """Move states as `LodUpdate` does, and point objects at those that serve them, int (n,).
-
-    All that it needs is allocated before the first state in use changes (`StateArrays.change`).
-    """
-    update = LodUpdate(models, states, moves)
-    moved = not np.array_equal(serving, objects.state)
-    staged = objects.stage_states(serving, states) if moved else None
-    update.launch()
-    if moved:
-        objects.set_states(serving, staged)
-    return update
-
-
-def replace_states(
-    models: ModelArrays, states: StateArrays, objects: ObjectArrays, wanted: list, serving: np.ndarray
-) -> np.ndarray:
-    """Make states of their own, point objects at them, and free all others; return their ids, int32.
-
-    Args:
-        wanted: Model and LOD of each state.
-        serving: Entry of that list that serves each object, int (n,).
-    """
-    ids = np.array(states.reserve([model for model, _ in wanted]), np.int32)
-    moves = [(state, lod, -1) for state, (_, lod) in zip(ids.tolist(), wanted, strict=True)]
-    move_objects(models, states, objects, moves, ids[serving])
-    states.free_others(ids)
-    return ids
-
-
-def set_object_lods(
-    models: ModelArrays, states: StateArrays, objects: ObjectArrays, object_model: np.ndarray, lods: np.ndarray
-) -> LodUpdate:
-    """Bring every object to an LOD: refine meshes, update trees, share states; states that no object uses are freed.
-
-    `object_model` and `lods` have model and target LOD, within its range, of each object, int (n,).
-    """
-    keys, inverse = np.unique((object_model.astype(np.int64) << 32) + lods, return_inverse=True)
-    wanted = [(key >> 32, key & (2**32 - 1)) for key in keys.tolist()]
-    used = set(np.unique(objects.state[objects.state >= 0]).tolist())
-    moves, chosen = choose_states(states, set(wanted), used)
-    update = move_objects(models, states, objects, moves, np.array([chosen[key] for key in wanted])[inverse.ravel()])
-    for state in used - set(chosen.values()):
-        states.free.setdefault(states.slots[state].model, []).append(state)
-    return update

@@ -14,7 +14,7 @@ from warp_abtree.state.batch import Batch
 def make_finest(batch: Batch) -> Batch:
     """Return a batch of the same objects at their finest LODs, as they are posed; their tree states are made once."""
     finest = batch.with_own_states(follows_poses=True)
-    finest.add_finest(range(len(batch.models.lod_max)))
+    finest.replace_states(list(enumerate(batch.models.lod_max.tolist())), batch.object_model)
     return finest
 
 
