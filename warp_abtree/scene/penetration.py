@@ -77,11 +77,8 @@ class _PosedBoxes:
     def __init__(self, batch: Batch):
         batch.catch_up()
         pool, state, states = batch.objects.pool, batch.objects.state, batch.states
-        self.rotation, self.position, box = (
-            pool.rotation.numpy(),
-            pool.position.numpy(),
-            np.zeros((len(states.slots), 2, 3)),
-        )
+        self.rotation, self.position = pool.rotation.numpy(), pool.position.numpy()
+        box = np.zeros((len(states.slots), 2, 3))
         for i in np.unique(state):
             box[i] = [corners[1] for corners in states.read_nodes(states.slots[i], 2)[:2]]
         self.half = (box[:, 1] - box[:, 0])[state] / 2
