@@ -109,16 +109,16 @@ def check_options(taken: dict, output: str, precision: str, options: dict) -> di
 
 def check_gap(gap, pair_count, object_count: int) -> np.ndarray:
     """Return gaps [world units] as `check_within`: () or (p,) beside given pairs, () or (n,) for the broad phase."""
+    if pair_count is not None:
+        return check_within(gap, pair_count, "gap")
     known = f"pairs of the broad phase: one for all, or one for each of {object_count} objects"
-    return check_within(gap, *((object_count, "gap", known) if pair_count is None else (pair_count, "gap")))
+    return check_within(gap, object_count, "gap", known)
 
 
 def check_within(within, pair_count=None, name="within", known=None) -> np.ndarray:
-    """Return distances [world units] as float64, () or (p,); errors have their name.
+    """Return distances [world units] as float64, () or (p,), for the broad phase one for all; errors have their name.
 
-    Raises:
-        ValueError: Another shape (for pairs of the broad phase any but a scalar), a distance that is negative, infinite
-            or no number.
+    Raises ValueError for another shape, and for a distance that is negative, infinite or no number.
     """
     within = to_numpy(within, name).astype(np.float64)
     if within.shape != () and within.shape != (pair_count,):

@@ -101,20 +101,18 @@ class PairDistance:
     """Distances of pairs [world units] that a stage reads: one for all, or one a pair beside given pairs.
 
     Args:
-        name: What errors call it.
+        name: What errors call it, and the owner's attribute that holds the device array of distances, float64 (pair,).
         value: The distances, as asked, from `check` on NumPy () or (p,); None where kernels write them.
-        owner, attribute: What holds the device array of distances, float64 (pair,).
         check: Returns a value, checked, for a number of pairs, None for those of the broad phase.
     """
 
-    def __init__(self, name: str, value, owner, attribute: str, check=check_within):
-        self.name, self.value, self._check = name, value, check
-        self._owner, self._attribute = owner, attribute
+    def __init__(self, name: str, value, owner, check=check_within):
+        self.name, self.value, self._owner, self._check = name, value, owner, check
 
     @property
     def rows(self) -> wp.array:
         """The device array of distances."""
-        return getattr(self._owner, self._attribute)
+        return getattr(self._owner, self.name)
 
     def check(self, value, pair_count: int | None) -> np.ndarray:
         """Return other distances, checked; None stands for those in place."""

@@ -20,7 +20,7 @@ from warp_abtree.query.stages.distance import DistanceQuery, check_beyond, check
 from warp_abtree.query.stages.intersect import Query
 from warp_abtree.query.stages.motion import FirstContactQuery
 from warp_abtree.scene.scene import Scene
-from warp_abtree.scene.sweep_poses import DeviceRows, PoseSlot, find_copy_stream, refuse_row, take_rows
+from warp_abtree.scene.sweep_poses import PoseSlot, find_copy_stream, refuse_row, take_rows
 from warp_abtree.state.arrays import ObjectArrays
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
@@ -121,7 +121,7 @@ class _ChunkQuery:
     def _load(self, slot, poses, start, count):
         """Bring poses into a slot whose last chunk is over."""
         width = slot.width
-        if isinstance(poses, DeviceRows):
+        if poses.flat is not None:
             wp.copy(slot.poses_flat, poses.flat, src_offset=width * start, count=width * count)
             return
         np.copyto(slot.poses_host.numpy().reshape(-1, width)[:count], poses.rows[start : start + count])

@@ -122,7 +122,7 @@ class DistanceStage(Stage):
         self._tolerances = frame.Tolerances()
         self.take_tolerances(tolerances)
         self.distances, self.found, self.slabs = report.Distances(), frame.NearestFound(), mean_slabs.Slabs()
-        self.distance = PairDistance("beyond", beyond, self.found, "beyond", check_beyond)
+        self.distance = PairDistance("beyond", beyond, self.found, check_beyond)
         self._views: dict = {}
         self._made_for: tuple = ()
 

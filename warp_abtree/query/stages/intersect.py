@@ -113,7 +113,7 @@ class VisitStage(HitStage):
 
     def __init__(self, within, question: Question, own):
         super().__init__(AskedVisits(question))
-        self.distance = PairDistance("within", within, proxy(self), "within")
+        self.distance = PairDistance("within", within, proxy(self))
         self.question, self._own = question, own
 
     def boxes(self, boxes):
@@ -154,7 +154,7 @@ class GapStage(Stage):
         if precision != "exact":
             raise ValueError(f"gap: needs precision 'exact', not {precision!r}")
         self._hits = hits
-        self.distance = PairDistance("gap", None, hits, "gap", lambda value, count: check_gap(value, count, 0))
+        self.distance = PairDistance("gap", None, hits, lambda value, count: check_gap(value, count, 0))
 
     def attach(self, operator: Operator):
         """Take the operator, and check the gap; what the broad phase reads of it goes to the device."""
