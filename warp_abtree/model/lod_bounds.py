@@ -157,11 +157,9 @@ class OutwardError:
         distance_sq = wp.zeros(len(point), dtype=wp.float64, device="cpu")
         inputs = [cpu_array(point, wp.vec3d), cpu_array(guess, int), original, distance_sq]
         wp.launch(outward_bound.measure_points_kernel, dim=len(point), inputs=inputs, device="cpu")
-        bound_sq = wp.zeros(len(corner), dtype=wp.float64, device="cpu")
+        bound_sq, rows = wp.zeros(len(corner), dtype=wp.float64, device="cpu"), outward_bound.ROWS
         inputs = [float(distance_sq.numpy().max()), cpu_array(corner, wp.vec3d), cpu_array(face_ids, int), original]
-        rows = outward_bound.ROWS
-        inputs += [make_scratch(1, 1, rows), wp.zeros(rows, dtype=int, device="cpu"), bound_sq]
-        wp.launch(outward_bound.bound_faces_kernel, dim=1, inputs=inputs, device="cpu")
+        launch(outward_bound.bound_faces_kernel, *inputs, make_scratch(1, 1, rows), filled(rows, 0), bound_sq)
         # ROUNDING is of coordinates up to 1/2; merged vertices may lie outside the box of the original ones.
         reach = max(1.0, 2 * float(np.abs(point).max()))
         return float(scale * (np.sqrt(bound_sq.numpy().max()) + ROUNDING * reach))

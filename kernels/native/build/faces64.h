@@ -49,7 +49,7 @@ struct Faces64 : Points64<Number> {
         thin = 1.0e-12 * ab_sq * ac_sq;
         has_sides = false;
     }
-    // As `segment_distance_sq`: start + along * t is the point of the edge nearest to p.
+    // start + along * t is the point of the edge nearest to p.
     static lanes edge_distance_sq(const Point& p, const Point& start, const Point& along, lanes t, const lanes& size) {
         const lanes zero = {}, one = zero + 1.0;
         t = size > 0.0 ? lower(higher(t / size, zero), one) : zero;
