@@ -1,5 +1,6 @@
 """Hits in the order of `Result.faces`, sorted on the host or on the device."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -120,18 +121,14 @@ class HitSort:
             if ends is None:
                 start = first_rows(staging.room("start", room + 1, wp.int32), room + 1)
                 ends, given = (start, *self._none[1:]), (*given, start.ptr)
-            for launch in operator.find_launches(
-                "segments",
-                lambda launch: make_segment_sort(operator.hits, count, threads, key, rows, ends, launch),
-                *given,
-            ):
+            make = partial(make_segment_sort, operator.hits, count, threads, key, rows, ends)
+            for launch in operator.find_launches("segments", make, *given):
                 launch()
             return True
         ends = self._none if ends is None else ends
         passes = sort_passes(room, int(operator.batch.models.face_count.max()), operator.regime.key_bits)
-        *makers, placer = operator.find_launches(
-            "sort", lambda launch: self._make_radix(count, passes, order, key, rows, ends, launch), *given
-        )
+        make = partial(self._make_radix, count, passes, order, key, rows, ends)
+        *makers, placer = operator.find_launches("sort", make, *given)
         for launch, widths in zip(makers, passes, strict=True):
             launch()
             radix_sort(key, order, count, sum(widths))
