@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.regime import Regime, change_regime, current_regime, restore_regime
+from warp_abtree.checks.regime import Regime, change_regime, current_regime
 from warp_abtree.kernels.exact.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.motion.face_pair import CLEAR, UNDECIDED, FirstContact
 from warp_abtree.kernels.motion.linear import advance_corners_kernel
@@ -51,7 +51,7 @@ def regime(**changes):
     try:
         yield
     finally:
-        restore_regime(before)
+        change_regime(**vars(before))
 
 
 def force_refits(full: bool | None):

@@ -28,5 +28,15 @@ def add_warp_sum(totals: wp.array(dtype=wp.int64), i: wp.int32, x: wp.int32):
 
 
 @native.func_native()
+def ends_launch(ended: wp.array(dtype=wp.int32), threads: wp.int32) -> bool:
+    """Return true to one thread, the last of a launch of so many to come here; it sees what warps added before.
+
+    Args:
+        ended: 0 before, and again when the launch is over, shape [1].
+        threads: A multiple of the threads of a warp.
+    """
+
+
+@native.func_native()
 def count_flags(totals: wp.array(dtype=wp.int64), i: wp.int32, flag: bool):
     """Count the set flags into totals[i], i >= 0 of each lane, with one atomic for those that share it."""

@@ -90,6 +90,10 @@ def add_in_order(sum: six_numbers, x: six_numbers, count: wp.int32) -> six_numbe
 
 
 @native.func_native()
+def warp_sum(x: wp.int32) -> wp.int32: ...
+
+
+@native.func_native()
 def warp_max(x: wp.float64) -> wp.float64: ...
 
 

@@ -1,7 +1,8 @@
-"""Signed distances of points from objects, the least of each, in the frame of each object: a thread a run of points.
+"""Signed distances of points from objects, the least of each, in the frame of each object.
 
-Points are sorted along a Morton curve, so that the nearest face of one is a good bound for the next. A point that lies
-nearer to the one before than the surface does lies on the same side; of others the even-odd ray test tells.
+Points are sorted along a Morton curve, so that the nearest face of one is a good bound for its neighbours. A point that
+lies nearer to such a one than the surface does lies on the same side; of others the even-odd ray test tells. A thread
+of the CPU goes from point to point of a run; a GPU measures few points first, which lead those between them.
 """
 
 import warp as wp
@@ -76,7 +77,7 @@ class PointDistances:
 
 @wp.struct
 class LastPoint:
-    """The point before, as the object of its answer sees it."""
+    """A point that was measured before, as the object of its answer sees it."""
 
     place: wp.int32  # of the object among those asked, -1 for none
     face: wp.int32  # NO_NEAREST for none
@@ -106,20 +107,107 @@ def pose_alone(trees: Trees, o: wp.int32):
     return pose
 
 
+@wp.func
+def read_last(
+    q: wp.int32,
+    within: wp.float64,
+    trees: Trees,
+    asked: wp.array(dtype=wp.vec2i),
+    points: wp.array(dtype=wp.vec3d),
+    found: PointDistances,
+):
+    """Return a point that was measured in a launch before."""
+    last = LastPoint()
+    last.place = -1
+    o = found.object[q]
+    for j in range(asked.shape[0]):
+        if asked[j][0] == o:
+            last.place = j
+    if last.place >= 0:
+        pose, centre = pose_alone(trees, o), trees.models.centre[trees.states.model[trees.objects.state[o]]]
+        last.point = wp.transpose(trees.objects.rotation[o]) * (points[q] - trees.objects.position[o])
+        last.face = wp.where(found.face[q] < 0, NO_NEAREST, found.face[q])
+        last.free = wp.min(wp.abs(found.distance[q]), within) - solid_about(trees, pose, centre, last.point).slack
+        last.inside = found.distance[q] < wp.float64(0.0)
+    return last
+
+
+@wp.func
+def measure_point(
+    q: wp.int32,
+    within: wp.float64,
+    trees: Trees,
+    asked: wp.array(dtype=wp.vec2i),
+    points: wp.array(dtype=wp.vec3d),
+    last: wp.ref[LastPoint],
+    found: PointDistances,
+):
+    """Write the least distance of a point, and let it be the last."""
+    first = last.place
+    least, object, nearest = wp.float64(within), wp.int32(NO_NEAREST), wp.int32(NO_NEAREST)
+    near = no_vector()
+    # The object of the point before comes first.
+    for j in range(-1, asked.shape[0]):
+        place = wp.where(j < 0, first, j)
+        if place >= 0 and (j < 0 or place != first):
+            o = asked[place][0]
+            pose = pose_alone(trees, o)
+            centre = trees.models.centre[trees.states.model[trees.objects.state[o]]]
+            point = wp.transpose(trees.objects.rotation[o]) * (points[q] - trees.objects.position[o])
+            solid = solid_about(trees, pose, centre, point)
+            reach = (wp.max(least, wp.float64(0.0)) + solid.margin) * solid.grow
+            root = load_node(trees.states, pose.node_a + 1)
+            meets = square_outside(root, point - centre) <= reach * reach
+            inside = bool(False)
+            if meets and asked[place][1] != 0:
+                inside = last.inside
+                if place != last.place or not wp.length(point - last.point) < last.free:
+                    inside = is_inside(trees, pose, False, centre, point)
+            if meets and (inside or least >= wp.float64(0.0)):
+                hint = wp.where(place == last.place, last.face, NO_NEAREST)
+                most = wp.where(inside, within, least)
+                enough = -wp.float64(1.0)
+                distance, face = nearest_face_within(trees, pose, solid, point, hint, enough, most)
+                signed = wp.where(inside, -distance, distance)
+                if inside and face == NO_NEAREST:
+                    signed = -wp.float64(wp.inf)
+                better = signed < least or (signed == least and o < object)
+                better = better and (inside or face != NO_NEAREST)
+                if better:
+                    least = signed
+                    object = o
+                    nearest = face
+                    near = place_on_face(trees, pose, o, face, point)
+                if better or last.place < 0 or place == last.place:
+                    last.place = place
+                    last.face = face
+                    last.point = point
+                    last.free = distance - solid.slack
+                    last.inside = inside
+    found.distance[q] = wp.where(object == NO_NEAREST, wp.float64(wp.inf), least)
+    found.object[q] = wp.where(object == NO_NEAREST, -1, object)
+    found.face[q] = wp.where(nearest == NO_NEAREST, -1, nearest)
+    found.nearest[q] = near
+
+
 @wp.kernel(module_options=MODULE_OPTIONS, module="unique")
 def measure_point_kernel(
     run: wp.int32,
+    step: wp.int32,
+    leader_step: wp.int32,
     within: wp.float64,
     trees: Trees,
     asked: wp.array(dtype=wp.vec2i),
     points: wp.array(dtype=wp.vec3d),
     order: wp.array(dtype=wp.int32),
-    found_out: PointDistances,
+    found_inout: PointDistances,
 ):
     """Write the least distances of points from some objects, negative inside, and where they are nearest.
 
     Args:
         run: Points of a thread.
+        step: Places between points in their order.
+        leader_step: The same of points that were measured before, each of which leads those behind it; 0 for none.
         within: Surfaces farther away are not looked for: distances are infinite.
         asked: Objects, rising, and whether they have an inside.
         order: Indices of points, neighbours beside each other.
@@ -127,51 +215,10 @@ def measure_point_kernel(
     last = LastPoint()
     last.place = -1
     for k in range(run):
-        i = run * wp.tid() + k
-        if i < points.shape[0]:
-            q = order[i]
-            first = last.place
-            least, object, nearest = wp.float64(within), wp.int32(NO_NEAREST), wp.int32(NO_NEAREST)
-            near = no_vector()
-            # The object of the point before comes first.
-            for j in range(-1, asked.shape[0]):
-                place = wp.where(j < 0, first, j)
-                if place >= 0 and (j < 0 or place != first):
-                    o = asked[place][0]
-                    pose = pose_alone(trees, o)
-                    centre = trees.models.centre[trees.states.model[trees.objects.state[o]]]
-                    point = wp.transpose(trees.objects.rotation[o]) * (points[q] - trees.objects.position[o])
-                    solid = solid_about(trees, pose, centre, point)
-                    reach = (wp.max(least, wp.float64(0.0)) + solid.margin) * solid.grow
-                    root = load_node(trees.states, pose.node_a + 1)
-                    meets = square_outside(root, point - centre) <= reach * reach
-                    inside = bool(False)
-                    if meets and asked[place][1] != 0:
-                        inside = last.inside
-                        if place != last.place or not wp.length(point - last.point) < last.free:
-                            inside = is_inside(trees, pose, False, centre, point)
-                    if meets and (inside or least >= wp.float64(0.0)):
-                        hint = wp.where(place == last.place, last.face, NO_NEAREST)
-                        most = wp.where(inside, within, least)
-                        enough = -wp.float64(1.0)
-                        distance, face = nearest_face_within(trees, pose, solid, point, hint, enough, most)
-                        signed = wp.where(inside, -distance, distance)
-                        if inside and face == NO_NEAREST:
-                            signed = -wp.float64(wp.inf)
-                        better = signed < least or (signed == least and o < object)
-                        better = better and (inside or face != NO_NEAREST)
-                        if better:
-                            least = signed
-                            object = o
-                            nearest = face
-                            near = place_on_face(trees, pose, o, face, point)
-                        if better or last.place < 0 or place == last.place:
-                            last.place = place
-                            last.face = face
-                            last.point = point
-                            last.free = distance - solid.slack
-                            last.inside = inside
-            found_out.distance[q] = wp.where(object == NO_NEAREST, wp.float64(wp.inf), least)
-            found_out.object[q] = wp.where(object == NO_NEAREST, -1, object)
-            found_out.face[q] = wp.where(nearest == NO_NEAREST, -1, nearest)
-            found_out.nearest[q] = near
+        place = step * (run * wp.tid() + k)
+        if place < points.shape[0]:
+            if leader_step == 0:
+                measure_point(order[place], within, trees, asked, points, last, found_inout)
+            elif place % leader_step != 0:
+                last = read_last(order[place - place % leader_step], within, trees, asked, points, found_inout)
+                measure_point(order[place], within, trees, asked, points, last, found_inout)

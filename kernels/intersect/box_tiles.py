@@ -3,17 +3,23 @@
 Objects are in the order of their groups, one a world. A tile is a warp of objects in this order; each task of a warp is
 a tile beside a few others from itself on. Where groups are large, their objects are sorted along a Morton curve in each
 launch, and boxes of tiles drop most of them. Source of the curve: Karras 2012, Thinking Parallel, part III.
+
+Where the objects of each group stay in the order of their numbers, pairs are listed in order without a sort: tasks keep
+which objects meet, a bit a pair, and count the pairs of each object; then a warp an object adds the counts of those
+before it, and lists its own.
 """
 
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ObjectPool
+from warp_abtree.kernels.base.arrays import LAST_KEY, ObjectPool, pair_key
 from warp_abtree.kernels.base.counters import reserve_slot
 from warp_abtree.kernels.base.lanes import (
     WARP_SIZE,
+    count_lanes,
     hold_uniform,
     lowest_bit,
+    next_place,
     value_of_lane,
     vector_of_lane,
     vote_lanes,
@@ -21,8 +27,16 @@ from warp_abtree.kernels.base.lanes import (
     warp_lane,
     warp_min32,
     warp_size,
+    warp_sum,
 )
-from warp_abtree.kernels.intersect.broad_phase import PairFilter, PosedBounds, box_middle, may_pair, write_pair
+from warp_abtree.kernels.intersect.broad_phase import (
+    COUNT_CHUNK,
+    PairFilter,
+    PosedBounds,
+    box_middle,
+    may_pair,
+    write_pair,
+)
 
 wp.set_module_options(native.options("base/counters.cuh", "base/lanes.cuh") | {"block_dim": WARP_SIZE})
 
@@ -38,6 +52,10 @@ class Tiles:
     order: wp.array(dtype=wp.int32)  # objects, shape [object], or more where it is sorted
     lower: wp.array(dtype=wp.vec3)  # shape [tile]; [0] where tiles have no boxes
     upper: wp.array(dtype=wp.vec3)  # shape [tile] or [0]
+    place: wp.array(dtype=wp.int32)  # of each object in the order, where pairs are listed in order, else [0]
+    task: wp.array(dtype=wp.int32)  # the first of each tile, then how many there are, or [0]
+    # A bit for each object of a task's other tile, a word for each of its tile, shape [task * lanes] or [0].
+    meets: wp.array(dtype=wp.int32)
 
 
 @wp.func
@@ -80,6 +98,7 @@ def load_tile_object(tile: wp.int32, filter: PairFilter, tiles: Tiles, boxes: Po
 def find_columns(
     own: TileObject,
     rows: wp.uint32,
+    task: wp.int32,
     tile: wp.int32,
     filter: PairFilter,
     tiles: Tiles,
@@ -89,6 +108,8 @@ def find_columns(
 ):
     """Find the pairs of some objects of a tile, a bit each, with those behind them in another, one a lane."""
     column = load_tile_object(tile, filter, tiles, boxes)
+    in_order, lane = tiles.meets.shape[0] > 0, warp_lane()
+    word, count = wp.int32(0), wp.int32(0)
     is_column = column.place < boxes.lower.shape[0]
     while rows != wp.uint32(0):
         k = lowest_bit(wp.int32(rows))
@@ -103,9 +124,19 @@ def find_columns(
         if warp_any(meets):
             if meets:
                 meets = may_pair(i, column.object, filter, objects)
-            slot = reserve_slot(boxes.pair_count, meets)
-            if meets:
-                write_pair(slot, i, column.object, pairs)
+            if in_order:
+                bits, number = vote_lanes(meets), count_lanes(meets)
+                word = wp.where(lane == k, wp.int32(bits), word)
+                count = wp.where(lane == k, number, count)
+            else:
+                slot = reserve_slot(boxes.pair_count, meets)
+                if meets:
+                    write_pair(slot, i, column.object, pairs)
+    if in_order:
+        tiles.meets[warp_size() * task + lane] = word
+        if count > 0:
+            wp.atomic_add(boxes.first_count, own.object, count)
+            wp.atomic_add(boxes.first_count, boxes.lower.shape[0] + own.object / COUNT_CHUNK, count)
 
 
 @wp.kernel
@@ -117,12 +148,13 @@ def find_tile_pair_kernel(
     boxes_inout: PosedBounds,
     pairs_out: wp.array(dtype=wp.vec2i),
 ):
-    """Find the pairs of a tile with so many others by a warp.
+    """Find the pairs of a tile with so many others by a warp; where they are listed in order, with one.
 
     Args:
         tasks: A tile, the first of the others, none before it, and how many these are.
     """
-    task = tasks[wp.tid() / warp_size()]
+    place = wp.tid() / warp_size()
+    task = tasks[place]
     if hold_uniform(boxes_inout.pair_count[0]) < 0:
         return
     lane, with_boxes = warp_lane(), tiles.lower.shape[0] > 0
@@ -140,8 +172,70 @@ def find_tile_pair_kernel(
             is_row = own.place < boxes_inout.lower.shape[0]
             if is_row and with_boxes:
                 is_row = bounds_meet(own.lower, own.upper, tiles.lower[tile], tiles.upper[tile])
-            find_columns(own, vote_lanes(is_row), tile, filter, tiles, objects, boxes_inout, pairs_out)
+            find_columns(own, vote_lanes(is_row), place, tile, filter, tiles, objects, boxes_inout, pairs_out)
         first += warp_size()
+
+
+@wp.func
+def count_before(i: wp.int32, boxes: PosedBounds):
+    """Return how many pairs have a first object before this one; for all lanes of a warp."""
+    count, lane = wp.int32(0), warp_lane()
+    chunk = wp.int32(lane)
+    while chunk < i / COUNT_CHUNK:
+        count += boxes.first_count[boxes.lower.shape[0] + chunk]
+        chunk += warp_size()
+    other = i / COUNT_CHUNK * COUNT_CHUNK + lane
+    while other < i:
+        count += boxes.first_count[other]
+        other += warp_size()
+    return warp_sum(count)
+
+
+@wp.kernel
+def list_tile_pair_kernel(
+    tasks: wp.array(dtype=wp.vec3i),
+    tiles: Tiles,
+    boxes_inout: PosedBounds,
+    pairs_out: wp.array(dtype=wp.vec2i),
+    key_out: wp.array(dtype=wp.int64),
+):
+    """List the pairs of each object with those behind it, in order, by a warp; the last one counts all.
+
+    Args:
+        key_out: Key of each pair, LAST_KEY behind the last, as long as the list or longer.
+    """
+    i, lane, n = wp.tid() / warp_size(), warp_lane(), boxes_inout.lower.shape[0]
+    own = boxes_inout.first_count[i]
+    if own == 0 and i < n - 1:
+        return
+    end = count_before(i, boxes_inout)
+    row, size = tiles.place[i] % warp_size(), warp_size()
+    tile = tiles.place[i] / size
+    first = wp.int32(tiles.task[tile])
+    last = tiles.task[tile + 1]
+    while own > 0 and first < last:
+        word = wp.int32(0)
+        if first + lane < last:
+            word = tiles.meets[size * (first + lane) + row]
+        words = vote_lanes(word != 0)
+        while words != wp.uint32(0):
+            k = lowest_bit(wp.int32(words))
+            words = drop_lowest_bit(words)
+            bits = wp.uint32(value_of_lane(word, k))
+            meets = ((bits >> wp.uint32(lane)) & wp.uint32(1)) != wp.uint32(0)
+            slot = next_place(end, meets)
+            if meets:
+                pair = wp.vec2i(i, tiles.order[size * tasks[first + k][1] + lane])
+                write_pair(slot, pair[0], pair[1], pairs_out)
+                if slot < pairs_out.shape[0]:
+                    key_out[slot] = pair_key(pair)
+        first += size
+    if i == n - 1:
+        boxes_inout.pair_count[0] = end
+        free = end + lane
+        while free < pairs_out.shape[0]:
+            key_out[free] = LAST_KEY
+            free += size
 
 
 @wp.kernel

@@ -12,6 +12,8 @@ from warp_abtree.kernels.base.poses import ROUNDING_64, measure_skew
 wp.set_module_options(native.options())
 
 MIDDLE_MAX = wp.constant(wp.float32(2.0**100))
+# Objects whose pairs are counted together, too, where pairs are listed in order.
+COUNT_CHUNK = wp.constant(128)
 # Of sums of lengths in float64.
 REACH_ROUNDING = wp.constant(wp.float64(1.0 + 2.0**-48))
 
@@ -23,6 +25,8 @@ class PosedBounds:
     lower: wp.array(dtype=wp.vec3)  # shape [object]
     upper: wp.array(dtype=wp.vec3)  # shape [object]
     pair_count: wp.array(dtype=wp.int32)  # perhaps more than there is room for, below 0 where it overflowed, shape [1]
+    # Pairs of which each object is the first, then sums of COUNT_CHUNK objects; [0] where pairs are found in no order.
+    first_count: wp.array(dtype=wp.int32)
 
 
 @wp.struct
@@ -37,7 +41,7 @@ class PairFilter:
 
 @wp.func
 def write_bounds(i: wp.int32, lower: wp.vec3, upper: wp.vec3, boxes: PosedBounds):
-    """Write the box of an object, infinite where it is no number; the first one starts the count of pairs."""
+    """Write the box of an object, infinite where it is no number, and start its counts of pairs."""
     for k in range(3):
         lower[k] = wp.where(lower[k] == lower[k], lower[k], -wp.inf)
         upper[k] = wp.where(upper[k] == upper[k], upper[k], wp.inf)
@@ -45,6 +49,10 @@ def write_bounds(i: wp.int32, lower: wp.vec3, upper: wp.vec3, boxes: PosedBounds
     boxes.upper[i] = upper
     if i == 0:
         boxes.pair_count[0] = 0
+    if boxes.first_count.shape[0] > 0:
+        boxes.first_count[i] = 0
+        if i % COUNT_CHUNK == 0:
+            boxes.first_count[boxes.lower.shape[0] + i / COUNT_CHUNK] = 0
 
 
 @wp.kernel

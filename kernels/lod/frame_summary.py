@@ -3,9 +3,10 @@
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.counters import add_lanes
+from warp_abtree.kernels.base.counters import add_lanes, ends_launch
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.intersect.face_pairs import Hits, read_total
+from warp_abtree.kernels.update.levels import LEVEL_STAYED, LEVEL_TURNED
 
 wp.set_module_options(native.options("base/counters.cuh"))
 
@@ -27,20 +28,25 @@ def summarise_frame_kernel(
     batch: PairBatch,
     hits: Hits,
     marked_count: wp.array(dtype=wp.int32),
-    changed: wp.array(dtype=wp.int32),
+    change: wp.array(dtype=wp.int32),
     level_count: wp.array(dtype=wp.int32),
-    frames_inout: wp.array(dtype=wp.int64),
+    threads: wp.int32,
+    sums_inout: wp.array(dtype=wp.int64),
+    ended_inout: wp.array(dtype=wp.int32),
     tests_out: wp.array(dtype=wp.int64),
     summary_out: wp.array(dtype=wp.int64),
 ):
-    """Sum the counts of all object pairs, a pair a thread; warps are whole.
+    """Sum the counts of all object pairs, a pair a thread; warps are whole. The last thread writes the sums.
 
     Args:
         marked_count: Nodes refitted of each tree state, shape [state]; [0] where none is updated.
-        changed: Objects that changed level, and those that turned back, shape [2].
+        change: As `Levels` has it, shape [object]; [0] without levels.
         level_count: Objects at each level, shape [level]; [0] without levels.
+        threads: Of the launch.
+        sums_inout: Words that are sums, 0 before and after, but for frames so far, shape [HEAD].
+        ended_inout: See `ends_launch`.
         tests_out: Tests of each object, of all its pairs, 0 before, shape [object]; [0] if they are not asked.
-        summary_out: Words as above, 0 before.
+        summary_out: Words as above, perhaps in memory of the host.
     """
     i = wp.tid()
     hit_count = wp.int64(0)
@@ -61,20 +67,29 @@ def summarise_frame_kernel(
             wp.atomic_add(tests_out, batch.pairs[i][1], tests)
     if i < marked_count.shape[0]:
         refitted = wp.int64(marked_count[i])
-    add_lanes(summary_out, wp.static(HITS), hit_count)
-    add_lanes(summary_out, wp.static(UNCERTAIN_PAIRS), uncertain)
-    add_lanes(summary_out, wp.static(INTERSECTING), met)
-    add_lanes(summary_out, wp.static(NODE_TESTS), node_tests)
-    add_lanes(summary_out, wp.static(TRIANGLE_TESTS), triangle_tests)
-    add_lanes(summary_out, wp.static(REFITTED), refitted)
+    changed = bool(False)
+    turned = bool(False)
+    if i < change.shape[0]:
+        changed = change[i] != LEVEL_STAYED
+        turned = change[i] == LEVEL_TURNED
+    add_lanes(sums_inout, wp.static(HITS), hit_count)
+    add_lanes(sums_inout, wp.static(UNCERTAIN_PAIRS), uncertain)
+    add_lanes(sums_inout, wp.static(INTERSECTING), met)
+    add_lanes(sums_inout, wp.static(NODE_TESTS), node_tests)
+    add_lanes(sums_inout, wp.static(TRIANGLE_TESTS), triangle_tests)
+    add_lanes(sums_inout, wp.static(REFITTED), refitted)
+    add_lanes(sums_inout, wp.static(CHANGED), wp.int64(wp.where(changed, 1, 0)))
+    add_lanes(sums_inout, wp.static(TURNED), wp.int64(wp.where(turned, 1, 0)))
     if i < level_count.shape[0]:
         summary_out[HEAD + i] = wp.int64(level_count[i])
-    if i == 0:
-        frames_inout[0] = frames_inout[0] + wp.int64(1)
-        summary_out[wp.static(FRAMES)] = frames_inout[0]
+    if ends_launch(ended_inout, threads):
+        frames = sums_inout[wp.static(FRAMES)] + wp.int64(1)
+        for k in range(HEAD):
+            summary_out[k] = sums_inout[k]
+            sums_inout[k] = wp.int64(0)
+        sums_inout[wp.static(FRAMES)] = frames
+        summary_out[wp.static(FRAMES)] = frames
         summary_out[wp.static(LAUNCHED)] = wp.int64(batch.launched[0])
         summary_out[wp.static(PAIRS)] = wp.int64(batch.count[0])
         summary_out[wp.static(APART)] = read_total(hits.apart_total)
         summary_out[wp.static(WITNESSES)] = read_total(hits.witness_total)
-        summary_out[wp.static(CHANGED)] = wp.int64(changed[0])
-        summary_out[wp.static(TURNED)] = wp.int64(changed[1])

@@ -8,9 +8,10 @@ every object at its level whatever the view. Sums are of whole numbers, so that 
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.counters import add_lanes
+from warp_abtree.kernels.base.counters import add_lanes, ends_launch
 from warp_abtree.kernels.lod.ladder import LodPool
 from warp_abtree.kernels.lod.tolerance import loosening
+from warp_abtree.kernels.lod.view import ViewArrays, measure_view
 
 wp.set_module_options(native.options("base/counters.cuh"))
 
@@ -44,6 +45,31 @@ class Prediction:
     power_down: wp.array(dtype=wp.float64)  # [level] faces to the exponent with which tests fall
     work: wp.array(dtype=wp.int64)  # [candidate] tests of all objects, each pair's counted for both of its objects
     nodes: wp.array(dtype=wp.int64)  # [candidate] nodes refitted
+    ended: wp.array(dtype=wp.int32)  # [1] warps that have added to them
+
+
+@wp.struct
+class Limits:
+    """What a position is chosen by."""
+
+    budget: wp.float64  # T [ms]
+    aim: wp.float64  # fraction of it that a change goes for
+    low: wp.float64  # fraction of it under which it climbs
+    hold_frames: wp.int32  # that a transition is held
+    position_max: wp.int32  # the finest position
+    stay: wp.int32  # candidate
+
+
+@wp.struct
+class LevelChoice:
+    """Choice of a position, and what levels of objects follow from it; of arrays [0] where there is none."""
+
+    held: wp.int32  # candidate that leaves every object at its level
+    lods: LodPool  # ladders, and objects
+    scale: wp.array(dtype=wp.int32)  # [2] position, and frames that a transition has been held
+    choice: wp.array(dtype=wp.float64)  # [6] see `choose_position`
+    offset: wp.array(dtype=wp.int32)  # [object] positions by which it is loosened
+    level: wp.array(dtype=wp.int32)  # [object] its level
 
 
 @wp.func
@@ -58,11 +84,15 @@ def level_at(lods: LodPool, i: wp.int32, position: wp.int32, offset: wp.int32):
 def begin_prediction_kernel(
     loosest: wp.float64,
     lods: LodPool,
-    focus: wp.array(dtype=wp.float64),
+    sees: bool,
+    rotation: wp.array(dtype=wp.mat33d),
+    position: wp.array(dtype=wp.vec3d),
+    view_inout: ViewArrays,
     prediction_inout: Prediction,
     offset_inout: wp.array(dtype=wp.int32),
 ):
-    """Convert the loosening of each object to positions, rounded down; raise the faces of each level to both exponents.
+    """Measure each object's view, if there is a camera, and convert its loosening to positions, rounded down; raise the
+    faces of each level to both exponents.
 
     Hysteresis: the offset follows only beyond a tolerance, so that an object between two levels does not flicker.
     """
@@ -75,7 +105,9 @@ def begin_prediction_kernel(
         prediction_inout.power_up[i] = wp.pow(faces, prediction_inout.rate[RATE_UP])
         prediction_inout.power_down[i] = wp.pow(faces, prediction_inout.rate[RATE_DOWN])
     if i < offset_inout.shape[0]:
-        octaves = wp.log2(loosening(focus[i], lods.importance[i], loosest))
+        if sees:
+            measure_view(i, rotation[i], position[i], view_inout)
+        octaves = wp.log2(loosening(view_inout.focus[i], lods.importance[i], loosest))
         offset = wp.int32(wp.floor(octaves * wp.float64(POSITIONS_PER_OCTAVE)))
         if offset < offset_inout[i] or offset > offset_inout[i] + DITHER:
             offset_inout[i] = offset
@@ -92,53 +124,6 @@ def predict_nodes(entries: wp.int32, faces: wp.int32, full_share: wp.float64):
         return whole
     k = wp.max(wp.float64(entries) * wp.float64(0.5), wp.float64(1.0))
     return wp.min(k * (wp.log2(wp.float64(faces)) - wp.log2(k) + wp.float64(2.0)), whole)
-
-
-@wp.kernel
-def predict_kernel(
-    chunks: wp.int32,
-    full_share: wp.float64,
-    lods: LodPool,
-    scale: wp.array(dtype=wp.int32),
-    offset: wp.array(dtype=wp.int32),
-    level: wp.array(dtype=wp.int32),
-    tests: wp.array(dtype=wp.int64),
-    prediction: Prediction,
-):
-    """Predict the tests and refits of every object for every candidate; one thread a candidate and chunk of objects.
-
-    Args:
-        chunks: Chunks that share the objects, a multiple of WARP.
-        level: Of each object now. tests: Of each object in the last frame.
-    """
-    k, chunk = wp.tid()
-    n = lods.object_model.shape[0]
-    held = prediction.change.shape[0] - 1
-    position = scale[0] + prediction.change[k]
-    total = wp.int64(0)
-    nodes = wp.int64(0)
-    i = chunk
-    while i < n:
-        model = lods.object_model[i]
-        a = model * lods.level_count + level[i]
-        b = a
-        if k < held:
-            b = model * lods.level_count + level_at(lods, i, position, offset[i])
-        found = tests[i]
-        if a != b and found > wp.int64(0):
-            share = wp.float64(found)
-            if lods.faces[b] > lods.faces[a]:
-                share = share * prediction.power_up[b] / prediction.power_up[a]
-            else:
-                share = share * prediction.power_down[b] / prediction.power_down[a]
-            found = wp.int64(wp.min(share, WORK_MOST) + wp.float64(0.5))
-        total += found
-        if a != b and lods.refits[model] != 0 and lods.entry[a] != lods.entry[b]:
-            entries = wp.abs(lods.entry[b] - lods.entry[a])
-            nodes += wp.int64(predict_nodes(entries, lods.face_count[model], full_share))
-        i += chunks
-    add_lanes(prediction.work, k, total)
-    add_lanes(prediction.nodes, k, nodes)
 
 
 @wp.func
@@ -181,19 +166,15 @@ def choose_climb(limit: wp.float64, budget: wp.float64, stay: wp.int32, predicti
     return stay
 
 
-@wp.kernel
-def choose_position_kernel(
-    budget: wp.float64,
-    aim: wp.float64,
-    low: wp.float64,
-    hold_frames: wp.int32,
-    position_max: wp.int32,
-    stay: wp.int32,
+@wp.func
+def choose_position(
+    limits: Limits,
     prediction: Prediction,
-    scale_inout: wp.array(dtype=wp.int32),
-    choice_out: wp.array(dtype=wp.float64),
+    scale: wp.array(dtype=wp.int32),
+    choice: wp.array(dtype=wp.float64),
+    told: wp.array(dtype=wp.float64),
 ):
-    """Choose a position on the tolerance scale; one thread.
+    """Choose a position on the tolerance scale.
 
     If `held` is over the budget: fall to the finest candidate within `aim` of it. If following the view at the same
     position costs under `low` of it: climb to the finest within `aim` whose transition fits into the budget. Between
@@ -201,51 +182,106 @@ def choose_position_kernel(
     for `hold_frames` and made then, otherwise a scene with expensive refits would never refine.
 
     Args:
-        scale_inout: Position, and frames that a transition has been held.
-        choice_out: Candidate, its steady and transition cost [ms], its work, the work of `held`, the position.
+        scale: Position, and frames that a transition has been held.
+        choice: Candidate, its steady and transition cost [ms], its work, the work of `held`, the position.
+        told: The same for the host.
     """
+    stay = wp.int32(limits.stay)
+    budget = wp.float64(limits.budget)
+    aim = limits.aim * budget
     held = prediction.change.shape[0] - 1
     chosen = stay
     waits = wp.int32(0)
     steady = steady_cost(prediction, stay)
     transition = transition_cost(prediction, stay)
     if steady_cost(prediction, held) > budget:
-        chosen = choose_fall(aim * budget, stay, prediction)
+        chosen = choose_fall(aim, stay, prediction)
     elif steady + transition > budget:
         chosen = held
         waits = 1
-    elif steady + transition < low * budget and scale_inout[0] < position_max:
-        chosen = choose_climb(aim * budget, budget, stay, prediction)
-        if chosen == stay and steady_cost(prediction, stay - 1) <= aim * budget:
+    elif steady + transition < limits.low * budget and scale[0] < limits.position_max:
+        chosen = choose_climb(aim, budget, stay, prediction)
+        if chosen == stay and steady_cost(prediction, stay - 1) <= aim:
             waits = 1
-    if waits == 1 and scale_inout[1] >= hold_frames:
+    if waits == 1 and scale[1] >= limits.hold_frames:
         waits = 0
         if chosen == held:
             chosen = stay
         else:
             chosen = stay - 1
-    scale_inout[1] = wp.where(waits == 1, scale_inout[1] + 1, 0)
-    scale_inout[0] = wp.clamp(scale_inout[0] + prediction.change[chosen], 0, position_max)
-    choice_out[0] = wp.float64(chosen)
-    choice_out[1] = steady_cost(prediction, chosen)
-    choice_out[2] = transition_cost(prediction, chosen)
-    choice_out[3] = work_of(prediction, chosen)
-    choice_out[4] = work_of(prediction, held)
-    choice_out[5] = wp.float64(scale_inout[0])
+    scale[1] = wp.where(waits == 1, scale[1] + 1, 0)
+    scale[0] = wp.clamp(scale[0] + prediction.change[chosen], 0, limits.position_max)
+    choice[0] = wp.float64(chosen)
+    choice[1] = steady_cost(prediction, chosen)
+    choice[2] = transition_cost(prediction, chosen)
+    choice[3] = work_of(prediction, chosen)
+    choice[4] = work_of(prediction, held)
+    choice[5] = wp.float64(scale[0])
+    for i in range(6):
+        told[i] = choice[i]
 
 
 @wp.kernel
-def set_level_kernel(
-    held: wp.int32,
-    lods: LodPool,
-    scale: wp.array(dtype=wp.int32),
-    offset: wp.array(dtype=wp.int32),
-    choice: wp.array(dtype=wp.float64),
-    level_inout: wp.array(dtype=wp.int32),
-    lod_out: wp.array(dtype=wp.int32),
+def predict_kernel(
+    chunks: wp.int32,
+    full_share: wp.float64,
+    tests: wp.array(dtype=wp.int64),
+    limits: Limits,
+    prediction: Prediction,
+    chosen_inout: LevelChoice,
+    told_out: wp.array(dtype=wp.float64),
 ):
-    """Give every object its level at the position, unless the choice is `held`."""
-    i = wp.tid()
-    if wp.int32(choice[0]) != held:
-        level_inout[i] = level_at(lods, i, scale[0], offset[i])
-    lod_out[i] = lods.lod[lods.object_model[i] * lods.level_count + level_inout[i]]
+    """Predict the tests and refits of every object for every candidate, one thread a candidate and chunk of objects;
+    then choose a position by these.
+
+    Args:
+        chunks: Chunks that share the objects, a multiple of WARP.
+        tests: Of each object in the last frame.
+        chosen_inout: With the position and levels as they are.
+        told_out: As for `choose_position`.
+    """
+    k, chunk = wp.tid()
+    lods = chosen_inout.lods
+    n = lods.object_model.shape[0]
+    held = prediction.change.shape[0] - 1
+    position = chosen_inout.scale[0] + prediction.change[k]
+    total = wp.int64(0)
+    nodes = wp.int64(0)
+    i = chunk
+    while i < n:
+        model = lods.object_model[i]
+        a = model * lods.level_count + chosen_inout.level[i]
+        b = a
+        if k < held:
+            b = model * lods.level_count + level_at(lods, i, position, chosen_inout.offset[i])
+        found = tests[i]
+        if a != b and found > wp.int64(0):
+            share = wp.float64(found)
+            if lods.faces[b] > lods.faces[a]:
+                share = share * prediction.power_up[b] / prediction.power_up[a]
+            else:
+                share = share * prediction.power_down[b] / prediction.power_down[a]
+            found = wp.int64(wp.min(share, WORK_MOST) + wp.float64(0.5))
+        total += found
+        if a != b and lods.refits[model] != 0 and lods.entry[a] != lods.entry[b]:
+            entries = wp.abs(lods.entry[b] - lods.entry[a])
+            nodes += wp.int64(predict_nodes(entries, lods.face_count[model], full_share))
+        i += chunks
+    add_lanes(prediction.work, k, total)
+    add_lanes(prediction.nodes, k, nodes)
+    if ends_launch(prediction.ended, prediction.change.shape[0] * chunks):
+        choose_position(limits, prediction, chosen_inout.scale, chosen_inout.choice, told_out)
+
+
+@wp.func
+def set_level(i: wp.int32, chosen: LevelChoice, lods: wp.array(dtype=wp.int32)):
+    """Give an object its level at the position, unless the choice is `held`, and the LOD there."""
+    if wp.int32(chosen.choice[0]) != chosen.held:
+        chosen.level[i] = level_at(chosen.lods, i, chosen.scale[0], chosen.offset[i])
+    lods[i] = chosen.lods.lod[chosen.lods.object_model[i] * chosen.lods.level_count + chosen.level[i]]
+
+
+@wp.kernel
+def set_level_kernel(chosen_inout: LevelChoice, lod_out: wp.array(dtype=wp.int32)):
+    """Give every object its level."""
+    set_level(wp.tid(), chosen_inout, lod_out)

@@ -33,30 +33,36 @@ def project_point(camera: wp.array(dtype=wp.float64), p: wp.vec3d):
     return wp.vec3d(camera[12] * x / depth, camera[12] * y / depth, wp.float64(1.0))
 
 
+@wp.func
+def measure_view(i: wp.int32, rotation: wp.mat33d, position: wp.vec3d, view: ViewArrays):
+    """Measure alpha, gamma and f of an object."""
+    n = view.object_model.shape[0]
+    camera = view.camera
+    p = rotation * view.centre[view.object_model[i]] + position
+    distance = wp.length(wp.vec3d(p[0] - camera[0], p[1] - camera[1], p[2] - camera[2]))
+    place = project_point(camera, p)
+    before = view.screen[i]
+    moved = wp.float64(0.0)
+    if place[2] > wp.float64(0.0) and before[2] > wp.float64(0.0):
+        moved = wp.length(place - before)
+    view.screen[i] = place
+    view.path[(view.frame[i] % view.window) * n + i] = moved
+    view.frame[i] = view.frame[i] + 1
+    motion = wp.float64(0.0)
+    for slot in range(view.window):
+        motion += view.path[slot * n + i]
+    view.distance[i] = distance
+    view.motion[i] = motion
+    wide = camera[13]
+    far = camera[14]
+    f = wp.min((far - distance) / far, (wide - motion) / wide)
+    view.focus[i] = wp.clamp(f, wp.float64(0.0), wp.float64(1.0))
+
+
 @wp.kernel
 def measure_view_kernel(
     rotation: wp.array(dtype=wp.mat33d), position: wp.array(dtype=wp.vec3d), view_inout: ViewArrays
 ):
-    """Measure alpha, gamma and f of every object."""
+    """Measure the view of every object."""
     i = wp.tid()
-    n = view_inout.object_model.shape[0]
-    camera = view_inout.camera
-    p = rotation[i] * view_inout.centre[view_inout.object_model[i]] + position[i]
-    distance = wp.length(wp.vec3d(p[0] - camera[0], p[1] - camera[1], p[2] - camera[2]))
-    place = project_point(camera, p)
-    before = view_inout.screen[i]
-    moved = wp.float64(0.0)
-    if place[2] > wp.float64(0.0) and before[2] > wp.float64(0.0):
-        moved = wp.length(place - before)
-    view_inout.screen[i] = place
-    view_inout.path[(view_inout.frame[i] % view_inout.window) * n + i] = moved
-    view_inout.frame[i] = view_inout.frame[i] + 1
-    motion = wp.float64(0.0)
-    for slot in range(view_inout.window):
-        motion += view_inout.path[slot * n + i]
-    view_inout.distance[i] = distance
-    view_inout.motion[i] = motion
-    wide = camera[13]
-    far = camera[14]
-    f = wp.min((far - distance) / far, (wide - motion) / wide)
-    view_inout.focus[i] = wp.clamp(f, wp.float64(0.0), wp.float64(1.0))
+    measure_view(i, rotation[i], position[i], view_inout)

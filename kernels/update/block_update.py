@@ -13,7 +13,7 @@ from warp_abtree.kernels.base.lanes import block_sync
 from warp_abtree.kernels.base.nodes import Node, load_node, store_node
 from warp_abtree.kernels.update.refine import refine_face
 from warp_abtree.kernels.update.refit import refit_inner, refit_leaf, unite_nodes
-from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
+from warp_abtree.kernels.update.work_lists import WHOLE, SplitTable, UpdateLists, find_slice, note_fault
 
 BLOCK_THREADS = 1024  # of a block, where there are few states or deep trees
 MODULE_OPTIONS = native.options("base/lanes.cuh", "update/block_marks.cuh")
@@ -226,10 +226,60 @@ def update_whole(own: BlockThread, models: ModelPool, states: StatePool):
         refit_block_level(own, models, states, top)
 
 
+@wp.func
+def update_state(own: BlockThread, models: ModelPool, states: StatePool, slice: wp.vec2i, plan: UpdateLists):
+    """Bring a state to its LOD, by a slice of faces or WHOLE; for all threads of a block.
+
+    Source: Liu et al. 2006, section 3.2.2, ACTIVE-UPDATE; Algorithms 1 to 3.
+    """
+    block_sync()
+    clear_marks(own, slice[1] == WHOLE)
+    block_sync()
+    if slice[1] == WHOLE:
+        update_whole(own, models, states)
+    else:
+        mark_slice(own, models, states, slice)
+        block_sync()
+        refit_slice(own, models, states, slice)
+    block_sync()
+    if own.thread == 0:
+        whole = 2 * models.face_count[states.model[own.state]] - 1
+        marked = wp.int32(read_word(own.marks, MARKED_COUNT))
+        plan.changed_count[own.state] = wp.int32(read_word(own.marks, CHANGED_COUNT))
+        plan.marked_count[own.state] = wp.where(slice[1] == WHOLE, whole, marked)
+
+
+@functools.cache
+def block_thread(shallow: bool):
+    """Return the function that makes a `BlockThread`, for trees of SHALLOW_DEPTH or of BLOCK_DEPTH at most."""
+    find_marks = shallow_marks if shallow else block_marks
+
+    @wp.func
+    def make_thread(
+        thread: wp.int32,
+        threads: wp.int32,
+        state: wp.int32,
+        models: ModelPool,
+        states: StatePool,
+        scratch: wp.array(dtype=wp.uint32),
+    ):
+        own = BlockThread()
+        own.thread = thread
+        own.threads = threads
+        own.state = state
+        own.marks = find_marks(scratch)
+        own.face_start = models.face_start[states.model[state]]
+        own.depth = models.depth[states.model[state]]
+        own.twice_start = MARK_START + (2 << own.depth)
+        return own
+
+    return make_thread
+
+
 @functools.cache
 def state_update(shallow: bool):
-    """Return the kernel that brings states to their LODs, for trees of SHALLOW_DEPTH or of BLOCK_DEPTH at most."""
-    find_marks = shallow_marks if shallow else block_marks
+    """Return the kernel that brings listed states to their LODs, for trees of a depth as `block_thread` has it."""
+    make_thread = block_thread(shallow)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS | {"block_dim": BLOCK_THREADS}, cuda_max_registers=64)
     def update_state_kernel(
@@ -240,39 +290,58 @@ def state_update(shallow: bool):
         states_inout: StatePool,
         plan_inout: UpdateLists,
     ):
-        """Bring one state after another to its LOD, a block each.
-
-        Source: Liu et al. 2006, section 3.2.2, ACTIVE-UPDATE; Algorithms 1 to 3.
-        """
+        """Bring one listed state after another to its LOD, a block each."""
         block, thread = wp.tid()
-        own = BlockThread()
-        own.thread = thread
-        own.threads = threads
-        own.marks = find_marks(scratch)
         update = wp.int32(block)
         while update < plan_inout.block_count[0]:
-            own.state = plan_inout.block_state[update]
-            model = states_inout.model[own.state]
-            own.face_start = models.face_start[model]
-            own.depth = models.depth[model]
-            own.twice_start = MARK_START + (2 << own.depth)
+            own = make_thread(thread, threads, plan_inout.block_state[update], models, states_inout, scratch)
             slice = wp.vec2i(plan_inout.block_start[update], plan_inout.block_length[update])
-            block_sync()
-            clear_marks(own, slice[1] == WHOLE)
-            block_sync()
-            if slice[1] == WHOLE:
-                update_whole(own, models, states_inout)
-            else:
-                mark_slice(own, models, states_inout, slice)
-                block_sync()
-                refit_slice(own, models, states_inout, slice)
-            block_sync()
-            if thread == 0:
-                marked = wp.int32(read_word(own.marks, MARKED_COUNT))
-                plan_inout.changed_count[own.state] = wp.int32(read_word(own.marks, CHANGED_COUNT))
-                plan_inout.marked_count[own.state] = wp.where(
-                    slice[1] == WHOLE, 2 * models.face_count[model] - 1, marked
-                )
+            update_state(own, models, states_inout, slice, plan_inout)
             update += blocks
 
     return update_state_kernel
+
+
+@functools.cache
+def wanted_update(shallow: bool):
+    """Return the kernel that brings states to LODs wanted, for trees of a depth as `block_thread` has it."""
+    make_thread = block_thread(shallow)
+
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS | {"block_dim": BLOCK_THREADS}, cuda_max_registers=64)
+    def update_wanted_kernel(
+        blocks: wp.int32,
+        threads: wp.int32,
+        models: ModelPool,
+        scratch: wp.array(dtype=wp.uint32),
+        splits: SplitTable,
+        wanted: wp.array(dtype=wp.int32),
+        states_inout: StatePool,
+        faults_inout: wp.array(dtype=wp.int32),
+        plan_out: UpdateLists,
+    ):
+        """Bring one state after another to its LOD, a block each, where a block takes all of them.
+
+        Args:
+            wanted, faults_inout: As for `plan_update_kernel`.
+            plan_out: Its counts of each state; nothing is listed.
+        """
+        block, thread = wp.tid()
+        state = wp.int32(block)
+        while state < wanted.shape[0]:
+            own = make_thread(thread, threads, state, models, states_inout, scratch)
+            model = states_inout.model[state]
+            old = states_inout.lod[state]
+            lod = wp.clamp(wanted[state], 0, models.lod_max[model])
+            # All threads have read the LOD before one writes it.
+            block_sync()
+            if thread == 0:
+                states_inout.lod[state] = lod
+                plan_out.changed_count[state] = 0
+                plan_out.marked_count[state] = 0
+                if lod != wanted[state]:
+                    note_fault(faults_inout, state)
+            if lod != old:
+                update_state(own, models, states_inout, find_slice(splits, model, old, lod), plan_out)
+            state += blocks
+
+    return update_wanted_kernel

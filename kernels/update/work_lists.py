@@ -135,6 +135,19 @@ def note_fault(faults: wp.array(dtype=wp.int32), i: wp.int32):
     wp.atomic_min(faults, 1, i)
 
 
+@wp.func
+def find_slice(splits: SplitTable, model: wp.int32, old: wp.int32, lod: wp.int32):
+    """Return where the faces between two LODs begin and how many there are, or WHOLE in the place of too many."""
+    slice = wp.vec2i(0, WHOLE)
+    if old != UNKNOWN:
+        at = splits.bound_start[model]
+        begin = splits.bound[at + wp.min(lod, old)]
+        length = splits.bound[at + wp.max(lod, old)] - begin
+        if length <= splits.partial_max[model]:
+            slice = wp.vec2i(begin, length)
+    return slice
+
+
 @wp.kernel
 def plan_update_kernel(
     models: ModelPool,
@@ -159,14 +172,8 @@ def plan_update_kernel(
     if lod == old:
         return
     states_inout.lod[s] = lod
-    begin = wp.int32(0)
-    length = wp.int32(WHOLE)
-    if old != UNKNOWN:
-        at = splits.bound_start[model]
-        begin = splits.bound[at + wp.min(lod, old)]
-        length = splits.bound[at + wp.max(lod, old)] - begin
-        if length > splits.partial_max[model]:
-            length = WHOLE
+    slice = find_slice(splits, model, old, lod)
+    begin, length = slice[0], slice[1]
     if length == WHOLE:
         if splits.block_whole[model] != 0:
             list_block(plan_inout, s, begin, length)

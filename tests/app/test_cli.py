@@ -20,8 +20,7 @@ import warp_abtree as ab
 import warp_abtree.app as ab_app
 from warp_abtree.app.cli import main as cli
 from warp_abtree.app.cli import model_commands, report
-from warp_abtree.app.open_playback import open_playback
-from warp_abtree.app.playback import MeshPlayback
+from warp_abtree.app.playback import MeshPlayback, open_playback
 from warp_abtree.model.mesh import describe_mesh, load_mesh
 
 COMMANDS = "info build query clash run sweep view picture bench".split()

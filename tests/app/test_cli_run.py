@@ -19,8 +19,8 @@ from helpers.viewer import run_command as run
 
 import warp_abtree as ab
 from warp_abtree.app import load_scene
-from warp_abtree.app.open_playback import open_playback
 from warp_abtree.app.pictures import command, scenes
+from warp_abtree.app.playback import open_playback
 from warp_abtree.app.styles import COLOURS, STAGE_LABELS
 
 

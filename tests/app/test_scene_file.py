@@ -11,7 +11,7 @@ from helpers.viewer import write_scene
 from warp_abtree.app import SceneError, load_scene
 from warp_abtree.app.pictures.scenes import panel_lods
 from warp_abtree.app.toml import decode, objects, scene_file
-from warp_abtree.app.toml.shapes import FACE_BOUNDS, GENERATED
+from warp_abtree.app.toml.models import FACE_BOUNDS, GENERATED
 from warp_abtree.app.toml.tables import SHAPES
 
 BALL = '[models.ball]\nshape = "icosphere"\nsubdivisions = 1\n'

@@ -13,7 +13,7 @@ from msgspec import convert, toml
 
 import warp_abtree as ab
 from warp_abtree.app import SceneError, load_scene
-from warp_abtree.app.toml.shapes import GENERATED
+from warp_abtree.app.toml.models import GENERATED
 from warp_abtree.app.toml.tables import AnyShape
 from warp_abtree.lod.timing import WorkClock
 

@@ -12,10 +12,9 @@ from oracles.motion import posed
 import warp_abtree as ab
 from warp_abtree.app import load_scene
 from warp_abtree.app import scene_geometry as geometry
-from warp_abtree.app.open_playback import open_playback, row_poses
 from warp_abtree.app.pictures import scenes
 from warp_abtree.app.pictures.render import camera_around
-from warp_abtree.app.playback import ScenePlayback
+from warp_abtree.app.playback import ScenePlayback, open_playback, row_poses
 from warp_abtree.app.render_data import Settings, compose, make_legend, objects_of_world
 from warp_abtree.app.styles import COLOURS
 from warp_abtree.app.viewer import viewer_scene as stages

@@ -352,7 +352,7 @@ def test_sort_in_a_graph(device):
     scene, pairs, poses = laid_out(device)
     query = ab.ContactQuery(scene, pairs)
     query.run()
-    query.resize(4 * len(query.hits.face))
+    query.make_room(hits=4 * len(query.hits.face))
     query.launch()
     with wp.ScopedCapture(device) as capture:
         query.launch()

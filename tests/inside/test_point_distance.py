@@ -29,6 +29,13 @@ def points_about(rng, corners, count):
     return np.concatenate([around, near, on, corners.reshape(-1, 3)[:count], 1e6 * size * around[: count // 4]])
 
 
+@pytest.fixture(autouse=True, params=["runs", "leaders"])
+def way(request, monkeypatch):
+    """Let threads go along runs of points, as those of the CPU do, or let few points lead others, as on a GPU."""
+    given = {"runs": (256, (1,)), "leaders": (1, (64, 8, 1))}[request.param]
+    monkeypatch.setattr(point_distance, "RUNS", {"cpu": given, "cuda": given})
+
+
 @pytest.mark.parametrize(
     ("name", "scale"), [*((name, 1.0) for name in NAMES), ("soup", 1e-6), ("small ball", 1e6), ("twins", 1e6)]
 )
@@ -85,7 +92,7 @@ def test_points_do_not_see_one_another(device, monkeypatch):
     rng, model = np.random.default_rng(1), sample("torus")
     points = np.concatenate([rng.uniform(-1, 1, (300, 3)), np.zeros((3, 3)), rng.uniform(-1e-3, 1e-3, (50, 3))])
     whole = ab.signed_distance(model, points, device=device, nearest=True)
-    for run in (1, 7, 1000):
+    for run in ((1, (1,)), (7, (1,)), (1000, (1,)), (1, (16, 4, 1)), (2, (100, 1))):
         monkeypatch.setattr(point_distance, "RUNS", {"cpu": run, "cuda": run})
         order = rng.permutation(len(points))
         for part, other in zip(whole, ab.signed_distance(model, points[order], device=device, nearest=True)):

@@ -130,6 +130,33 @@ def test_many_objects_after_moves_and_lods(device, far):
     assert len(check_pairs(scene, poses, worlds, statics)) > 600
 
 
+@pytest.mark.parametrize("worlds", ["one", "some", "shared first", "shared"])
+def test_sorted_pairs_and_their_keys(device, worlds):
+    """As many as there is room for, and how many there are, in the order of the objects."""
+    rng = np.random.default_rng(5)
+    names, poses, world = rng.choice(NAMES, 300), random_poses(rng, 300, 2.5), np.zeros(300, int)
+    if worlds in ("some", "shared"):
+        world = rng.integers(0 if worlds == "some" else -1, 3, 300)
+    elif worlds == "shared first":
+        world[:2] = -1
+    scene = make_scene(device, names, poses, world, rng.random(300) < 0.2)
+    scene.filter([(0, 1), (7, 3), (250, 90)])
+    expected = scene.broad_phase()
+    assert len(expected) > 300
+    for room in (len(expected) + 100, len(expected), len(expected) // 2):
+        broad_phase = BroadPhase(scene.batch(), room, sorts=True)
+        for _ in range(2):
+            broad_phase.launch()
+        assert broad_phase.count_found() == len(expected)
+        if room >= len(expected):
+            np.testing.assert_array_equal(broad_phase.pairs.numpy()[: len(expected)], expected)
+            keys = broad_phase.key.numpy()[:room]
+            np.testing.assert_array_equal(
+                keys[: len(expected)], (expected.astype(np.int64) << 32) @ [1, 0] + expected[:, 1]
+            )
+            assert (keys[len(expected) :] == 2**63 - 1).all()
+
+
 def exact_box(scene, i, pose):
     """Return lower and upper end of an object's posed root box, three fractions each, for a pose taken as a matrix."""
     state, centre = raw_state(scene, i), scene.models[scene.object_model[i]].centre

@@ -14,10 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
 from warp_abtree.interop.robot import check, robot
-from warp_abtree.interop.robot.check import make_link_request
 from warp_abtree.interop.robot.description import Part, RobotFrame
-from warp_abtree.interop.robot.link_query import LinkHits
-from warp_abtree.interop.robot.surroundings import RobotBatch
 from warp_abtree.kernels.robot import forward, link_pairs
 from warp_abtree.model.mesh import mesh_from_arrays
 
@@ -207,13 +204,12 @@ def reach_kernel(
 def find_reach(description, device, middle, half, size):
     """Return the reach of the only part at a configuration, and where its vertices stand there as computed."""
     robot = ab.Robot(description, device)
-    batch = RobotBatch(None, robot.models, 1, robot.device)
-    links = LinkHits(batch.batch, make_link_request(robot, batch, 1), 1, True)
+    links = check.RobotQuery(robot, None, "within", 1)
     for target, values in ((links.configurations, middle), (links.chunk.half, half), (links.chunk.size, size)):
         target.assign(np.array(values, np.float64)[None])
     links.place()
     reach = wp.zeros(1, dtype=wp.float64, device=device)
-    inputs = [links.request.chain, links.frames, links.request.parts, links.chunk, reach]
+    inputs = [links.chain, links.frames, links.parts, links.chunk, reach]
     wp.launch(reach_kernel, 1, inputs, device=device)
     rotation, position = (
         a.numpy()[0, -1].astype(np.longdouble) for a in (links.frames.rotation, links.frames.position)

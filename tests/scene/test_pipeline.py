@@ -179,13 +179,13 @@ def test_launches_of_a_frame(device, monkeypatch, name, levels, update_path):
     for count in (2, 40):
         scene = add_objects(device, [name] * count)
         large = sum(count << level > 1024 for level in range(levels))  # nodes of all states on a level
-        states = 3 if testing.current_regime().block_updates else 6 + large
-        for options, own in (({}, states), ({"ladder": [[0, 1]]}, 1)):
+        states = 1 if testing.current_regime().block_updates else 6 + large
+        for options, own in (({}, states), ({"ladder": [[0, 1]]}, 0)):
             for asked, broad in (({}, 2), ({"pairs": [(0, 1)], "within": 1.0}, 2 if cuda else 1)):
                 frame = ab.Pipeline(scene, "count", **asked, **options)
                 launched.clear()
                 frame.capture()
-                assert len(launched) == 1 + own + broad + narrow + 1
+                assert len(launched) == 1 + own + broad + narrow
 
 
 def test_a_frame_waits_for_nothing(device, monkeypatch):

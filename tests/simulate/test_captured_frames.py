@@ -113,6 +113,24 @@ def test_captured_frames_are_launched_ones(device, kind, output):
     assert max(seen) > 5 and (len(lods) > 1) == changes
 
 
+@pytest.mark.parametrize("camera", [None, camera_at])
+def test_launches_of_a_frame_under_control(device, monkeypatch, camera):
+    """Two choose a position, one arranges objects, three find pairs, four what meets, one sums up; none clears."""
+    with testing.regime(captures_frames=True, warps=True):
+        scene, motion = crowd(device)
+        controller = PredictiveController(scene, 1e9, camera, steps=5)
+        frame = ab.Frame(scene, motion, controller, "count", 1 / 30)
+        frame.run(1)
+        made = []
+        for owner, name in ((wp, "launch"), (wp.array, "zero_"), (wp.array, "fill_"), (wp.utils, "radix_sort_pairs")):
+            call = getattr(owner, name)
+            monkeypatch.setattr(
+                owner, name, lambda *args, _call=call, **options: made.append(1) or _call(*args, **options)
+            )
+        frame.run(1)
+        assert len(made) == 11
+
+
 @pytest.mark.parametrize("kind", ["function", "tolerance", "coarse ladder"])
 def test_answers_are_those_of_a_scene_at_the_same_lods(device, kind):
     """Objects whose levels have tree states, and objects with states of their own."""

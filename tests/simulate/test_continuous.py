@@ -153,7 +153,7 @@ def test_a_step_without_room_for_pairs_moves_nothing_and_says_so(device):
     models = [(BRICK, (1.1 * k, 0, 0, 0, 0, 0, 1)) for k in range(4)]
     options = {"velocity": [(30.0 * (1.5 - k), 0, 0) for k in range(4)], "continuous": True, **FREE}
     dynamics = make(device, *models, capacity=Buffers(pairs=1), **options)
-    dynamics.certified.resize(0)
+    dynamics.certified.make_room(hits=0)
     before = dynamics.poses()
     dynamics.query.grow()
     dynamics._grow()

@@ -153,7 +153,7 @@ def test_results_without_a_launch(device, operator):
     for change, why in (
         (lambda: None, "nothing was launched"),
         (lambda: query.set_pairs(PAIRS[:2]), "nothing was launched"),
-        (lambda: query.resize(30_000), "buffers were replaced"),
+        (lambda: query.make_room(hits=30_000), "buffers were replaced"),
     ):
         change()
         refused(RuntimeError, why, query.result)

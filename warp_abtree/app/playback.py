@@ -3,15 +3,23 @@
 A playback owns its scene: one thread steps, queries and changes it.
 """
 
+from pathlib import Path
+
 import numpy as np
 
+from warp_abtree.app.cli.arguments import Parser, positive_count
+from warp_abtree.app.cli.model_commands import load_models, lod_at
 from warp_abtree.app.render_data import Snapshot, worlds_of
 from warp_abtree.app.scene_view import make_view
 from warp_abtree.app.toml.control import CONTROLLERS, LodControl
+from warp_abtree.app.toml.folder import find_scene
+from warp_abtree.app.toml.scene_file import load_assembly, load_scene
+from warp_abtree.interop.scenes import is_assembly
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame
 from warp_abtree.simulate.lod_request import LodSweep
 
+OVERLAP = 0.25  # of the smaller extent: by so much a mesh without a pose reaches into the one before
 SWEEP_PERIOD = 8.0  # seconds from the finest LOD of a mesh to its base and back
 OWN_MODE, HOLD_MODE = "scene", "hold"  # LODs as the scene chooses them, and as they are
 
@@ -19,12 +27,8 @@ OWN_MODE, HOLD_MODE = "scene", "hold"  # LODs as the scene chooses them, and as 
 class Playback:
     """A scene that runs: each step is a frame, timed by stage.
 
-    Attributes:
-        worlds: World of each object, int (n,); -1 is in every one.
-        view: eye and up, directions, and world, to begin with.
-        camera: Called with a time [s], returns the `Camera` that LODs are for; or None.
-        chosen: LOD of every object, int (n,).
-        mode: Of choosing LODs, one of `modes`.
+    `view` is its `SceneView` to begin with, `camera` called with a time [s] returns the one that LODs are for, `chosen`
+    are the LODs of all objects, and `mode` of `modes` is how they are chosen.
     """
 
     def __init__(self, scene, title, worlds, time_step, view, camera=None, control=None):
@@ -35,18 +39,14 @@ class Playback:
         self.restart()
 
     def _begin(self) -> tuple:
-        """Return the `Frame` of a new start, its rigid bodies or None, and what chooses its LODs or None."""
-        raise NotImplementedError
-
-    def _poses_now(self) -> np.ndarray:
-        """Return the poses of all objects now, (n, 7)."""
+        """Begin anew: return the `Frame`, what chooses its LODs or None, rigid bodies or None, and poses by time."""
         raise NotImplementedError
 
     def restart(self):
-        """Go back to the start; the mode of choosing LODs stays."""
-        self._frame, self._bodies, self._own = self._begin()
+        """Go back to the start, in the same mode."""
+        self._frame, self._own, self._bodies, self._poses_at = self._begin()
         self.number, self.chosen, self._first = 0, self.scene.lods, self.scene.lods
-        self._poses = self._poses_now()
+        self._poses = self._poses_at(0.0)
         self.choose(self.mode, self._budget)
 
     @property
@@ -106,7 +106,7 @@ class Playback:
         result = self._frame.step()
         self.chosen, row = self.scene.lods, self._frame.history[-1]
         self.number = row.frame
-        self._poses = self._poses_now()
+        self._poses = self._poses_at(self.time)
         if self._bodies is not None:
             # The bodies have moved on: the result shown is of their poses now.
             result = self.scene.intersect(output=output)
@@ -124,10 +124,8 @@ class ScenePlayback(Playback):
     def _begin(self):
         bodies = self.loaded.make_bodies()
         frame = self.loaded.frame(bodies=bodies)
-        return frame, bodies, frame.lods
-
-    def _poses_now(self):
-        return self.loaded.motion.poses(self.time) if self._bodies is None else self._bodies.poses()
+        poses = self.loaded.motion.poses if bodies is None else lambda _: bodies.poses()
+        return frame, frame.lods, bodies, poses
 
 
 class StillPlayback(Playback):
@@ -147,10 +145,7 @@ class StillPlayback(Playback):
         self.scene.set_lods(self.started)
         frame = Frame(self.scene, None, self._sweep, "count", self.time_step)
         frame.warm_up()
-        return frame, None, self._sweep
-
-    def _poses_now(self):
-        return self._held
+        return frame, self._sweep, None, lambda _: self._held
 
 
 class MeshPlayback(StillPlayback):
@@ -177,3 +172,67 @@ class MeshPlayback(StillPlayback):
 
 def _fraction_at(model, lod) -> float:
     return model.progressive.active_count(lod) / model.face_count
+
+
+def open_playback(paths, device=None, progress=None, objects=None, poses=(), lod=None) -> Playback:
+    """Open one scene file (.toml), one file of several objects, or meshes and built models (.npz).
+
+    Poses (k, 7) are of the meshes after the first; those left out are laid beside the mesh before, a little inside.
+    `lod` is of every mesh, None the finest; `objects` is for scene files alone, as for `load_scene`.
+    """
+    paths = [str(find_scene(path)) for path in paths]
+    scenes = [path for path in paths if Path(path).suffix.lower() == ".toml"]
+    if scenes and len(paths) > 1:
+        raise ValueError(f"{scenes[0]}: a scene file is looked at alone")
+    if objects is not None and not scenes:
+        raise ValueError("--objects: for scene files")
+    if not scenes and (len(paths) > 1 or not is_assembly(paths[0])):
+        return _open_meshes(paths, device, progress, poses, lod)
+    for name, value in (("--pose", len(poses)), ("--lod", lod is not None)):
+        if value:
+            raise ValueError(f"{name}: for meshes; {paths[0]} says where its objects are and at which LODs")
+    if scenes:
+        return ScenePlayback(load_scene(paths[0], device=device, progress=progress, objects=objects))
+    return ScenePlayback(load_assembly(Path(paths[0]), device, progress))
+
+
+def _open_meshes(paths, device, progress, poses, lod) -> MeshPlayback:
+    if len(poses) >= len(paths):
+        raise ValueError(f"--pose: {len(poses)} given for the {len(paths) - 1} meshes after the first")
+    Scene(device=device)  # refuses a device that does not exist before models are built
+    models = load_models(paths, progress)
+    lods = [lod_at("--lod", model, "finest" if lod is None else lod) for model in models]
+    places = row_poses(models)
+    if len(poses):
+        places[1 : 1 + len(poses)] = poses
+    try:
+        return MeshPlayback(models, places, lods, device)
+    except ValueError as error:
+        raise ValueError(f"--{error}") from None
+
+
+def add_playback_arguments(sub: Parser):
+    """Add the arguments that name what is shown."""
+    about = "one scene file (.toml) or file of several objects, or meshes and built models (.npz)"
+    sub.add_scene("source", nargs="+", metavar="SCENE_OR_MESHES", help=about)
+    about = "pose of the second mesh, again for the third; without it each stands beside the one before, a bit inside"
+    sub.add_pose(about, action="append", default=[])
+    sub.add_argument("--lod", metavar="LOD", help="LOD of meshes, as for query (finest)")
+    sub.add_number("--objects", "about so many objects of a scene, as for run", positive_count)
+
+
+def row_poses(models) -> np.ndarray:
+    """Return poses (n, 7) in a row along x, in which each model reaches a little into the one before."""
+    places = np.zeros((len(models), 7))
+    places[:, 6] = 1.0
+    boxes = []
+    for model in models:
+        vertices = model.mesh_at(model.lod_max)[0]
+        boxes.append((vertices.min(axis=0), vertices.max(axis=0)))
+    middle = 0.5 * (boxes[0][0] + boxes[0][1])
+    for i in range(1, len(models)):
+        (before_lower, before_upper), (lower, upper) = boxes[i - 1], boxes[i]
+        places[i, :3] = middle - 0.5 * (lower + upper)
+        inside = OVERLAP * min(upper[0] - lower[0], before_upper[0] - before_lower[0])
+        places[i, 0] = places[i - 1, 0] + before_upper[0] - inside - lower[0]
+    return places

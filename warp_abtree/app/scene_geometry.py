@@ -1,7 +1,4 @@
-"""Geometry of a scene at one time, as arrays in the world: intersecting faces, bounds.
-
-The viewer sends these arrays to the browser, and pictures draw them.
-"""
+"""Geometry of a scene at one time, as arrays in the world, which the viewer sends to the browser and pictures draw."""
 
 from functools import cached_property
 

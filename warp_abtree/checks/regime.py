@@ -50,9 +50,3 @@ def change_regime(**changes) -> Regime:
     global _current
     before, _current = _current, replace(_current, **changes)
     return before
-
-
-def restore_regime(regime: Regime):
-    """Put a regime back."""
-    global _current
-    _current = regime

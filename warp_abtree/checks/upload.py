@@ -28,6 +28,21 @@ def zeros_of(struct, rows, columns, device):
     return made
 
 
+class Download:
+    """Numbers that kernels write where the host reads them: on a GPU in pinned memory of the host.
+
+    Attributes:
+        array: For kernels, (count,), 0 at first.
+        view: NumPy's view of them, up to date once the launches are over.
+    """
+
+    def __init__(self, count: int, dtype, device):
+        self._host = self.array = wp.zeros(count, dtype=dtype, device="cpu", pinned=device.is_cuda)
+        if device.is_cuda:
+            self.array = wp.array(ptr=self._host.ptr, dtype=dtype, shape=count, device=device)
+        self.view = self._host.numpy()
+
+
 class Upload:
     """Numbers on a device, float64, and memory of the host that is copied there without waiting; on the CPU one array.
 

@@ -7,12 +7,66 @@ import numpy as np
 
 from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.checks.device_memory import DeviceMemory
-from warp_abtree.interop.collision_data import ContactData, DistanceData
 from warp_abtree.interop.placed_shapes import PlacedShapes, shape_of
 from warp_abtree.state.poses import check_poses
 
 EXTERNAL = "__external"  # trimesh's name for a mesh that is not in the manager
 FIRST_PAIRS = 64  # tested first if one collision is enough
+
+
+class PairData:
+    """Two named objects and a face of each."""
+
+    __slots__ = ("_faces", "names")
+
+    def __init__(self, names, faces):
+        self.names = set(names)
+        self._faces = dict(zip(names, faces))
+
+    def index(self, name) -> int:
+        """Return the index of the named object's face in its mesh."""
+        return self._faces[name]
+
+
+class ContactData(PairData):
+    """One contact, as trimesh.collision.ContactData.
+
+    Attributes:
+        names: Names of the two objects, a set.
+        point: Midpoint of the segment [world units], float64 (3,).
+        normal: Unit normal from the first object of the pair to the second, float64 (3,).
+        depth: How far the deepest point of one object inside the other, a solid, is from the surface; of surfaces, how
+            deep the two faces are in one another [world units].
+        segment: End points of the segment in which the two faces intersect; where one object is wholly inside the
+            other, that deepest point and the surface's nearest one [world units], float64 (2, 3).
+    """
+
+    __slots__ = ("depth", "normal", "point", "segment")
+
+    def __init__(self, names, faces, segment, normal, depth):
+        super().__init__(names, faces)
+        self.segment, self.normal, self.depth = segment, normal, depth
+        self.point = 0.5 * (segment[0] + segment[1])
+
+
+class DistanceData(PairData):
+    """The nearest points of two objects, as trimesh.collision.DistanceData.
+
+    Attributes:
+        names: Names of the two objects, a set.
+        distance: Distance between them [world units]; 0 if they intersect.
+    """
+
+    __slots__ = ("_points", "distance")
+
+    def __init__(self, names, faces, points, distance):
+        super().__init__(names, faces)
+        self._points = dict(zip(names, points))
+        self.distance = distance
+
+    def point(self, name) -> np.ndarray:
+        """Return the nearest point of the named object [world units], float64 (3,)."""
+        return self._points[name]
 
 
 def _join(first, *rest):
@@ -29,22 +83,18 @@ class CollisionManager(DeviceMemory):
     pair, and a `DistanceData`, both None where there is no pair. All of them wait for the device. Closed meshes are
     solids, all others surfaces. Differences:
 
-    * Answers are exact for the given poses (FCL rounds those of `add_object` to float32 and tests convex meshes
-      iteratively). Touching is a collision. What lies inside any closed mesh collides with it, not only inside a convex
-      one.
-    * A contact is a pair of intersecting faces with their indices, also of convex meshes. Its depth is that of the pair
-      of objects if one is a solid that holds points of the other: how far the deepest of these is from the surface
-      (`query.stages.distance`); else how deep the two faces are in one another. An object wholly inside a solid
-      gives one contact, whose segment joins that deepest point and the surface.
-    * Distances [world units] are negative where solids are deep in one another, by that depth, a lower bound of the
-      penetration depth; 0 where surfaces merely intersect, infinite if there are no objects. They are exact to the
-      rounding of coordinates, for convex meshes too.
+    * Answers are exact for the given poses, also of convex meshes. Touching is a collision, and so is what lies inside
+      any closed mesh.
+    * A contact is a pair of intersecting faces, see `ContactData`. An object wholly inside a solid gives one, whose
+      segment joins its deepest point and the surface.
+    * Distances [world units] are negative where solids are deep in one another, by how far the deepest point of one in
+      the other is from the surface (`query.stages.distance`), a lower bound of the penetration depth; 0 where surfaces
+      merely intersect, infinite if there are no objects.
     * Transforms must be rigid within 1e-6; an object of the same name is replaced; `add_object` returns nothing.
 
-    Cost: meshes are prepared once for all managers, by content. The first call after `add_object` of a mesh without a
-    free slot uploads all models again; so do the first `in_collision_single` of a new mesh and `in_collision_other` of
-    new meshes. Other calls upload poses only. A removed object leaves a slot for another of the same mesh; free slots
-    are released when they outnumber objects, and 16.
+    Cost: meshes are prepared once for all managers, by content. The first call after a new mesh, of `add_object`,
+    `in_collision_single` or `in_collision_other`, uploads all models again, others poses only. A removed object leaves
+    a slot for another of the same mesh; free slots are released when they outnumber objects, and 16.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0"; None for Warp's default.
@@ -89,7 +139,7 @@ class CollisionManager(DeviceMemory):
         try:
             for _, shape, matrix in guests:
                 slots.append(self._placed.add(shape, matrix))
-            names, own = self._own()
+            names, own = list(self._slots), np.array(list(self._slots.values()), np.int32)
             pairs = np.stack([np.repeat(own, len(slots)), np.tile(np.array(slots, np.int32), len(own))], 1)
             yield pairs, lambda k: (names[k // len(slots)], guests[k % len(slots)][0])
         finally:
@@ -102,9 +152,11 @@ class CollisionManager(DeviceMemory):
             raise ValueError(f"{name} not in collision manager!")
         return self._slots[name]
 
-    def _own(self):
-        """Return the names of all objects and their slots."""
-        return list(self._slots), np.array(list(self._slots.values()), np.int32)
+    def _pairs_within(self):
+        """Return all pairs of slots of objects, and a function of an index that returns the pair's names."""
+        names, own = list(self._slots), np.array(list(self._slots.values()), np.int32)
+        i, j = np.triu_indices(len(own), 1)
+        return np.stack([own[i], own[j]], 1), lambda k: (names[i[k]], names[j[k]])
 
     def _external(self, mesh, transform):
         return [(EXTERNAL, shape_of(mesh, EXTERNAL), self._matrix(transform, EXTERNAL))]
@@ -192,12 +244,9 @@ class CollisionManager(DeviceMemory):
 
         Raises ValueError if no object has this name.
         """
-        names, own = self._own()
-        i, j = np.triu_indices(len(own), 1)
-        if name is not None:
-            asked = (np.stack([own[i], own[j]]) == self._slot(name)).any(0)
-            i, j = i[asked], j[asked]
-        distance, pair, data = self._nearest(np.stack([own[i], own[j]], 1), lambda k: (names[i[k]], names[j[k]]))
+        pairs, names = self._pairs_within()
+        asked = np.arange(len(pairs)) if name is None else np.flatnonzero((pairs == self._slot(name)).any(1))
+        distance, pair, data = self._nearest(pairs[asked], lambda k: names(asked[k]))
         return _join(distance, (return_names, pair and tuple(sorted(pair))), (return_data, data))
 
     def min_distance_other(self, other_manager, return_names=False, return_data=False):
@@ -222,18 +271,17 @@ class CollisionManager(DeviceMemory):
         Raises:
             ValueError: No object has a name, a transform is not rigid within 1e-6, or turns by half a revolution.
         """
-        names, own = self._own()
         ends = np.array(self._placed.poses[: self._placed.scene.object_count]).reshape(-1, 4, 4)
         for name, transform in transforms.items():
             ends[self._slot(name)] = self._matrix(transform, name)
         _, at_first = self.in_collision_internal(return_names=True)
         time, pair = (0.0, min(at_first)) if at_first else (1.0, None)
-        if not at_first and len(own) > 1:
-            i, j = np.triu_indices(len(own), 1)
-            found = self._placed.scene.first_contact(np.stack([own[i], own[j]], 1), ends, tolerance)
+        pairs, names = self._pairs_within()
+        if not at_first and len(pairs):
+            found = self._placed.scene.first_contact(pairs, ends, tolerance)
             k = int(found.time.argmin())
             if not found.clear[k]:
-                time, pair = float(found.time[k]), tuple(sorted((names[i[k]], names[j[k]])))
+                time, pair = float(found.time[k]), tuple(sorted(names(k)))
         return _join(time, (return_names, pair))
 
     # Computation.
@@ -285,8 +333,8 @@ class CollisionManager(DeviceMemory):
         placed = self._placed
         placed.upload()
         gaps = placed.gaps(pairs)
-        _, likely = placed.upper_distance(pairs, gaps)
-        k, result = likely, placed.scene.intersect(pairs[[likely]], "distance")
+        k = likely = placed.find_likely(pairs, gaps)
+        result = placed.scene.intersect(pairs[[likely]], "distance")
         distance, row = float(result.distance[0]), 0
         # Of the others, what is proved farther than that is not searched to its end.
         others = np.flatnonzero(gaps <= distance)

@@ -1,15 +1,10 @@
 """Contacts for Newton's solvers: `NewtonContacts` fills a `newton.Contacts` from meshes that are near or intersect.
 
 Its `collide` stands in the place of that of a `newton.CollisionPipeline`: the poses of bodies are copied to a scene's
-objects, `ManifoldQuery` finds the contact points, and these are written in Newton's conventions: shapes, points and
-offsets in body frames, normals from the first shape to the second. Everything stays on the device, in the order of
-pairs, and is deterministic.
-
-As Newton has it, two shapes have contacts where their distance is under the sum of both margins and both gaps
-(`ShapeConfig`), and rest with both margins between them. Newton's own gap of 0.1 m a shape makes very many contacts of
-fine meshes: give one that bodies move in a step. Depths and normals are those of `query.stages.points`. Pairs of
-shapes of which one is no mesh, and particles, are passed to a pipeline of Newton's, whose contacts come first. Tested
-with Newton 1.8 (extra `newton`), which calls its contacts experimental.
+objects, `ManifoldQuery` finds the contact points, and these are written in Newton's conventions: points and offsets in
+body frames, normals from the first shape to the second, contacts where shapes are nearer than both margins and gaps.
+Everything stays on the device, in the order of pairs, and is deterministic. Pairs of which one is no mesh, and
+particles, are passed to a pipeline of Newton's, whose contacts come first. Tested with Newton 1.8 (extra `newton`).
 """
 
 from typing import Any
@@ -44,11 +39,13 @@ def same_body_pairs(body):
     return [pairs_between(part, part) for part in parts if len(part) > 1]
 
 
-def group_pairs(group, world):
-    """Return the pairs of objects that may share a world, of groups that do not collide.
+def groups_collide(a, b):
+    """Return whether groups collide: positive ones with themselves and negative ones, those with others, 0 never."""
+    return (a != 0) & (b != 0) & np.where((a > 0) & (b > 0), a == b, a != b)
 
-    Positive groups collide with themselves and negative ones, negative ones with all but themselves, 0 with none.
-    """
+
+def group_pairs(group, world):
+    """Return the pairs of objects that may share a world, of groups that do not collide."""
     found = []
     if len(np.unique(group)) == 1 and group[0] > 0:
         return found
@@ -57,8 +54,7 @@ def group_pairs(group, world):
         names = np.unique(group[here]).tolist()
         for k, low in enumerate(names):
             for high in names[k:]:
-                collide = low != 0 and high != 0 and (low == high if low > 0 else low != high)
-                if not collide:
+                if not groups_collide(low, high):
                     found.append(pairs_between(here[group[here] == low], here[group[here] == high]))
     return found
 
@@ -83,19 +79,16 @@ def _other_pairs(model, is_mesh, collide):
     """Return the pairs of shapes that collide and are not both meshes, as Newton's own list has, (k, 2), sorted."""
     names = ("shape_body", "shape_collision_group", "shape_world")
     body, group, world = (np.asarray(getattr(model, name).numpy(), np.int64) for name in names)
-    collide = collide & (group != 0)
     found = [np.empty((0, 2), np.int64)]
     for place in np.unique(world[collide & ~is_mesh]):
         rows = np.flatnonzero(collide & ~is_mesh & (world == place))
         here = collide if place < 0 else collide & ((world == place) | (world < 0))
         found.append(pairs_between(rows, np.flatnonzero(here)))
     pairs = np.sort(np.concatenate(found), axis=1)
-    first, second = group[pairs].T
-    meet = np.where(first > 0, (first == second) | (second < 0), first != second)
     low, high = np.maximum(body[pairs], -1).T
-    keys = np.unique(pairs[meet & (low != high)] @ [int(model.shape_count), 1])
-    keys = np.setdiff1d(keys, np.sort(_filtered_pairs(model), axis=1) @ [int(model.shape_count), 1])
-    return np.stack(np.divmod(keys, int(model.shape_count)), 1).astype(np.int32)
+    pairs, count = pairs[groups_collide(*group[pairs].T) & (low != high)], int(model.shape_count)
+    keys = np.setdiff1d(pairs @ [count, 1], np.sort(_filtered_pairs(model), axis=1) @ [count, 1])
+    return np.stack(np.divmod(keys, count), 1).astype(np.int32)
 
 
 def _find_solids(shapes, solids):
@@ -258,9 +251,8 @@ class NewtonContacts(DeviceMemory):
 
     def contacts(self, rigid_contact_max=None):
         """Return an empty `newton.Contacts`; by default with room for all points of each pair."""
-        room = rigid_contact_max
+        room, others = rigid_contact_max, min(len(self._pairs_of_others), OTHERS_MAX)
         if room is None:
-            others = min(len(self._pairs_of_others), OTHERS_MAX)
             room = self.query.point_max * len(self.query.pairs) + POINTS_MAX * others
         if not self._has_others:
             matching = self.query.memory is not None
@@ -341,14 +333,13 @@ class NewtonContacts(DeviceMemory):
             contacts.clear()
         else:
             self.others.collide(state, contacts)
-        body_q = state.body_q
         wp.copy(self._first, contacts.rigid_contact_count, count=1)
         rigid = kernels.RigidContacts()
         rigid.count = contacts.rigid_contact_count
         for name in CONTACT_FIELDS:
             setattr(rigid, name, getattr(contacts, f"rigid_contact_{name}"))
         query, room = self.query, len(self._count)
-        body_q = self._no_body if body_q is None else body_q
+        body_q = self._no_body if state.body_q is None else state.body_q
         inputs = [query.pair_batch, query.manifolds, self._count]
         wp.launch(kernels.count_point_kernel, room, inputs, device=self.device)
         with wp.ScopedDevice(self.device):

@@ -13,14 +13,7 @@ PAIRS_AT_ONCE = 2**16  # pairs whose corners are compared at a time
 
 
 class Shape:
-    """A model and its original mesh on the host, float64, model frame.
-
-    Attributes:
-        model: `Model`.
-        is_closed: Whether it may be a solid.
-        middle, half: Centre and half extents of its box, (3,) each.
-        corners: Extreme corners along each axis in both directions, (6, 3).
-    """
+    """A model, and in its frame the centre and half extents of its box, (3,), and its extreme corners, (6, 3)."""
 
     def __init__(self, model):
         self.model = model
@@ -102,8 +95,8 @@ class PlacedShapes:
             self.scene.set_poses(np.array(self.poses[: self.scene.object_count]))
             self._moved = False
 
-    def boxes(self):
-        """Return centres and half extents of all boxes in the world, (n, 3) each, rounded outwards."""
+    def gaps(self, pairs):
+        """Return a lower bound on the distance of each pair, that of their boxes, rounded outwards, (p,)."""
         poses = np.array(self.poses[: len(self.shapes)]).reshape(-1, 4, 4)
         middle, half = np.array([(shape.middle, shape.half) for shape in self.shapes]).reshape(-1, 2, 3).swapaxes(0, 1)
         rotation, position = poses[:, :3, :3], poses[:, :3, 3]
@@ -113,16 +106,12 @@ class PlacedShapes:
         pad = 3 * skew * size + 1e-12 * (size + np.abs(position).max(1, initial=0))
         middle = np.einsum("nij,nj->ni", rotation, middle) + position
         half = np.einsum("nij,nj->ni", np.abs(rotation), half)
-        return middle, half * (1 + 1e-9) + pad[:, None]
-
-    def gaps(self, pairs):
-        """Return a lower bound on the distance of each pair, that of their boxes, (p,)."""
-        middle, half = self.boxes()
+        half = half * (1 + 1e-9) + pad[:, None]
         i, j = pairs.T
         return np.linalg.norm(np.maximum(np.abs(middle[i] - middle[j]) - half[i] - half[j], 0), axis=1)
 
-    def upper_distance(self, pairs, gaps):
-        """Return an upper bound on the least distance of all pairs, that of two corners, and the index of its pair."""
+    def find_likely(self, pairs, gaps) -> int:
+        """Return the index of the pair that has the nearest corners, which bounds the least distance of all."""
         corners = np.array([s.corners @ p[:3, :3].T + p[:3, 3] for s, p in zip(self.shapes, self.poses)])
         upper, likely = np.inf, 0
         for start in range(0, len(pairs), PAIRS_AT_ONCE):
@@ -132,4 +121,4 @@ class PlacedShapes:
                 apart = np.linalg.norm(corners[i, :, None] - corners[j, None], axis=-1).min((1, 2))
                 if apart.min() < upper:
                     upper, likely = float(apart.min()), int(part[apart.argmin()])
-        return upper, likely
+        return likely

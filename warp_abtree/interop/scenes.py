@@ -187,19 +187,18 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
 
     count, present = scene.object_count, np.flatnonzero(scene.present).tolist()
     if names is None:
-        # Places without an object come last: they have no node, and must not change the names of others.
-        names = _distinct([*map(scene.name, present), *["removed"] * (count - len(present))])
-        names = np.array(names, object)[np.argsort(np.argsort(~scene.present, kind="stable"))]
-    names = list(names)
-    if len(names) != count or len(set(names)) != count or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"names: not {count} different strings")
+        node = dict(zip(present, _distinct(map(scene.name, present))))
+    else:
+        node = dict(enumerate(names))
+        if len(node) != count or len(set(node.values())) != count or not all(isinstance(n, str) for n in node.values()):
+            raise ValueError(f"names: not {count} different strings")
     if result is not None and len(result.pairs) and int(result.pairs.max()) >= count:
         raise ValueError(f"result: asks object {int(result.pairs.max())}, the scene has {count}")
     hit = {} if result is None else _intersecting_faces(result)
     objects = scene.batch().objects.pool
     worlds, rotation, position = objects.world.numpy(), objects.rotation.numpy(), objects.position.numpy()
     # The frame of all others is no object's.
-    made = trimesh.Scene(base_frame=_distinct([*names, "world"])[-1])
+    made = trimesh.Scene(base_frame=_distinct([*node.values(), "world"])[-1])
     for i in present:
         if world is not None and worlds[i] not in (world, -1):
             continue
@@ -211,13 +210,13 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
             red = np.isin(face_ids, hit[i]) if hit[i] is not None else np.ones(len(faces), bool)
             # glTF has colours per vertex: faces of two colours must not share any.
             vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
-            geometry, colours = f"{names[i]} hit", np.repeat(np.where(red[:, None], hit_colour, colour), 3, axis=0)
+            geometry, colours = f"{node[i]} hit", np.repeat(np.where(red[:, None], hit_colour, colour), 3, axis=0)
         if geometry not in made.geometry:
             colours = np.concatenate([colours, np.full((len(colours), 1), 255)], 1).astype(np.uint8)
             made.geometry[geometry] = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation[i], position[i]
-        made.graph.update(names[i], geometry=geometry, matrix=pose)
+        made.graph.update(node[i], geometry=geometry, matrix=pose)
     return made
 
 

@@ -19,8 +19,7 @@ _pairs_of: WeakKeyDictionary = WeakKeyDictionary()
 def pose_rows(poses, query: DistanceQuery) -> wp.array:
     """Return poses of all objects as rows of 7 or 16 numbers on the query's device, without a copy.
 
-    Raises:
-        ValueError: Another type, shape, number or device, or memory with gaps.
+    Raises ValueError for another type, shape, number or device, or memory with gaps.
     """
     array = wrap_array(poses, "poses")
     if array.device != query.device:
@@ -35,9 +34,9 @@ def pose_rows(poses, query: DistanceQuery) -> wp.array:
 
 
 class PosedDistances:
-    """Distances of a query's pairs at poses of all objects, and what the gradients by the poses need.
+    """Distances of a query's pairs at poses of all objects, which stay there, and what the gradients need.
 
-    The objects stay at these poses. Waits for the device.
+    Waits for the device. Raises as `pair_distance` of `warp_abtree.interop.torch`; no object has moved then.
 
     Args:
         query: `DistanceQuery` that was given its pairs.
@@ -46,9 +45,6 @@ class PosedDistances:
     Attributes:
         distance: Device float64 (p,).
         gradient: As `Result.gradient`, on the device.
-
-    Raises:
-        ValueError: A pose is none, and no object has moved.
     """
 
     def __init__(self, query: DistanceQuery, rows: wp.array):
@@ -69,13 +65,7 @@ class PosedDistances:
 
 
 def check_query(query: Any):
-    """Raise where a query cannot give `PosedDistances`.
-
-    Raises:
-        TypeError: No `DistanceQuery`.
-        ValueError: One that runs the broad phase.
-        RuntimeError: A graph is being captured, or as `DistanceQuery.launch`.
-    """
+    """Raise where a query cannot give `PosedDistances`, as `pair_distance` of `warp_abtree.interop.torch`."""
     if not isinstance(query, DistanceQuery):
         raise TypeError(f"query: a DistanceQuery is expected, not a {type(query).__name__}")
     check_device(query.device, "pair_distance (PoseInput and DistanceQuery.launch can)")
@@ -107,12 +97,11 @@ def record_pair_distance(tape: wp.Tape, query: DistanceQuery, poses: wp.array) -
             float64, or Warp's transforms or matrices (n,).
 
     Returns:
-        Distances, float64 (p,), with a gradient. That by a quaternion is of the normalised one, and that by a matrix
-        within the rigid motions.
+        Distances, float64 (p,), with a gradient, as that of `interop.torch.pair_distance`.
 
     Raises:
-        TypeError, ValueError, RuntimeError: As `check_query` and `PosedDistances`; no tape; or poses of another shape,
-            count, type or device, or without a gradient. No object has moved.
+        TypeError, ValueError, RuntimeError: As `interop.torch.pair_distance`; no tape; or poses without a gradient. No
+            object has moved.
     """
     if not isinstance(tape, wp.Tape):
         raise TypeError(f"tape: a wp.Tape is expected, not a {type(tape).__name__}")

@@ -45,8 +45,9 @@ class _StageReader:
 
     def __init__(self, path, stage, remarks):
         import trimesh
-        from pxr import Usd, UsdGeom
+        from pxr import Usd, UsdGeom, UsdSkel
 
+        self.usd, self.geom, self.skel = Usd, UsdGeom, UsdSkel
         self.path, self.stage, self.remarks = path, stage, remarks
         self.time = Usd.TimeCode.EarliestTime()
         if stage.HasAuthoredTimeCodeRange():
@@ -57,53 +58,45 @@ class _StageReader:
 
     def visit(self, root, prefix, transform_of):
         """Add what lies under a prim, nodes named with a prefix, where `transform_of` each is, a matrix of USD."""
-        from pxr import Usd, UsdGeom
-
-        prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies()))
+        geom, proxies = self.geom, self.usd.TraverseInstanceProxies()
+        prims = iter(self.usd.PrimRange(root, proxies))
         for prim in prims:
             name = prefix + str(prim.GetPath())
-            shape = prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer)
-            purpose = UsdGeom.Imageable(prim).ComputePurpose() if shape else None
-            if self._is_hidden(prim):
+            spreads = prim.IsA(geom.PointInstancer)
+            shape, shown = spreads or prim.IsA(geom.Gprim), geom.Imageable(prim)
+            purpose = shown.ComputePurpose() if shape else None
+            hidden = bool(shown) and shown.GetVisibilityAttr().Get(self.time) == geom.Tokens.invisible
+            if hidden or spreads:
                 prims.PruneChildren()
-                below = Usd.PrimRange(prim, Usd.TraverseInstanceProxies())
-                if any(part.IsA(UsdGeom.Gprim) or part.IsA(UsdGeom.PointInstancer) for part in below):
+            if hidden:  # and all under it
+                below = self.usd.PrimRange(prim, proxies)
+                if any(part.IsA(geom.Gprim) or part.IsA(geom.PointInstancer) for part in below):
                     self.remarks.add("left out", f"{name} (invisible)")
             elif shape and purpose not in SHOWN:
                 self.remarks.add("left out", f"{name} (purpose {purpose})")
-                if prim.IsA(UsdGeom.PointInstancer):
-                    prims.PruneChildren()
-            elif prim.IsA(UsdGeom.PointInstancer):
-                prims.PruneChildren()
-                self._spread(UsdGeom.PointInstancer(prim), name, transform_of(prim))
+            elif spreads:
+                self._spread(geom.PointInstancer(prim), name, transform_of(prim))
             elif shape:
                 self._add(prim, name, transform_of(prim))
 
-    def _is_hidden(self, prim) -> bool:
-        """Return whether a prim hides itself and all under it."""
-        from pxr import UsdGeom
-
-        shown = UsdGeom.Imageable(prim)
-        return bool(shown) and shown.GetVisibilityAttr().Get(self.time) == UsdGeom.Tokens.invisible
-
     def _add(self, prim, name, transform):
         import trimesh
-        from pxr import UsdGeom
 
-        if prim.IsA(UsdGeom.Mesh):
-            found = read_usd_mesh(UsdGeom.Mesh(prim), self.time, f"{self.path}: {prim.GetPath()}")
+        if prim.IsA(self.geom.Mesh):
+            source = self.geom.Mesh(prim)
+            found = read_usd_mesh(source, self.time, f"{self.path}: {prim.GetPath()}")
             if found is None:
                 return
             vertices, faces = found
-            self._remark_on(UsdGeom.Mesh(prim), name)
-            if UsdGeom.Mesh(prim).GetOrientationAttr().Get(self.time) == UsdGeom.Tokens.leftHanded:
+            self._remark_on(source, name)
+            if source.GetOrientationAttr().Get(self.time) == self.geom.Tokens.leftHanded:
                 faces = faces[:, ::-1]
         else:
-            shape = _make_shape(prim, self.time)
-            if shape is None:
+            found = _make_shape(prim, self.time)
+            if found is None:
                 self.remarks.add("left out", f"{name} ({prim.GetTypeName()})")
                 return
-            vertices, faces = shape
+            vertices, faces = found
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         geometry = self._known.setdefault((mesh.vertices.tobytes(), mesh.faces.tobytes()), str(prim.GetPath()))
         self.scene.geometry.setdefault(geometry, mesh)
@@ -111,12 +104,10 @@ class _StageReader:
 
     def _remark_on(self, mesh, name):
         """Remember what of a mesh is not carried out. One whose file is silent about subdivision is a polygon mesh."""
-        from pxr import UsdSkel
-
         scheme = mesh.GetSubdivisionSchemeAttr()
         if scheme.HasAuthoredValue() and scheme.Get() != "none":
             self.remarks.add("not subdivided:", f"{name} ({scheme.Get()})")
-        skin = UsdSkel.BindingAPI(mesh.GetPrim())
+        skin = self.skel.BindingAPI(mesh.GetPrim())
         if skin.GetInheritedSkeleton() or skin.GetBlendShapeTargetsRel().HasAuthoredTargets():
             self.remarks.add("taken at rest:", f"{name} (skin or blend shapes)")
 
@@ -150,7 +141,10 @@ def _make_shape(prim, time):
 
     kind = prim.GetTypeName()
     if kind == "Plane":
-        return _make_plane(get("width") / 2, get("length") / 2, get("axis"))
+        x, y = get("width") / 2 * np.array([-1, 1, 1, -1]), get("length") / 2 * np.array([-1, -1, 1, 1])
+        flat = np.zeros(4)
+        corners = {"X": [flat, y, -x], "Y": [x, flat, -y], "Z": [x, y, flat]}[get("axis")]
+        return np.stack(corners, 1), np.array([[0, 1, 2], [0, 2, 3]])
     makers = {
         "Cube": lambda: creation.box(extents=[get("size")] * 3),
         "Sphere": lambda: creation.icosphere(subdivisions=SUBDIVISIONS, radius=get("radius")),
@@ -165,11 +159,3 @@ def _make_shape(prim, time):
     # Of USD all have their middle at the origin.
     vertices = vertices - (vertices.min(0) + vertices.max(0)) / 2
     return vertices[:, AXIS_COLUMNS[get("axis") if prim.HasAttribute("axis") else "Z"]], np.asarray(mesh.faces)
-
-
-def _make_plane(width, length, axis):
-    """Return two triangles of half a width and half a length, whose normal is the axis."""
-    x, y = np.array([-width, width, width, -width]), np.array([-length, -length, length, length])
-    flat = np.zeros(4)
-    vertices = {"X": [flat, y, -x], "Y": [x, flat, -y], "Z": [x, y, flat]}[axis]
-    return np.stack(vertices, 1), np.array([[0, 1, 2], [0, 2, 3]])

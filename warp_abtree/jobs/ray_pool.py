@@ -104,90 +104,66 @@ class RayPool:
         Raises:
             RuntimeError: A shard ended its worker three times, or workers do not start.
         """
-        self.lost = 0
-        running = _Run(self, job, ranges)
+        ray, self.lost = self.ray, 0
+        # Actors, ranges not sent yet, and by Ray reference (actor, range), of which the range is None while it starts.
+        actors: list = []
+        self._actors, self._left, self._running = actors, deque(ranges), dict()
+        self._failures: dict = {}  # how often each range has ended its actor; of None, how often one failed to start
+        runner = ray.put(job.runner())
         try:
-            yield from running.results()
+            for _ in range(min(self.workers, len(self._left))):
+                self._start_actor(runner)
+            while self._left or any(part is not None for _, part in self._running.values()):
+                done, _ = ray.wait(list(self._running), num_returns=1)
+                actor, part = self._running[done[0]]
+                try:
+                    answer = ray.get(done[0])
+                except ray.exceptions.RayTaskError as error:
+                    raise error.cause from None
+                except (ray.exceptions.RayActorError, ray.exceptions.ObjectLostError) as error:
+                    self._take_back(actor, " ".join(str(error).split())[:300])
+                    self._start_actor(runner)
+                    continue
+                del self._running[done[0]]
+                if part is None:
+                    self.pids[actor] = answer
+                    self._failures.pop(None, None)
+                for _ in range(AHEAD if part is None else 1):
+                    if self._left:
+                        following = self._left.popleft()
+                        self._running[actor.run.remote(job.task(*following))] = actor, following
+                if part is not None:
+                    del done  # Ray frees the answer with its last reference
+                    yield *part, answer
         finally:
             self.pids.clear()
-            for actor in running.actors:
-                running.kill(actor)
+            for actor in actors:  # a later run has others
+                self._kill(actor)
 
+    def _start_actor(self, runner):
+        share, device = ({"num_gpus": 1, "num_cpus": 0}, "cuda:0") if self.on_gpus else ({"num_cpus": 1}, "cpu")
+        actor = self.ray.remote(_Actor).options(**share).remote(runner, device)
+        self._actors.append(actor)
+        self._running[actor.ready.remote()] = actor, None
 
-class _Run:
-    """State of one job on a `RayPool`: the actors, and which shards each has been sent.
-
-    Attributes:
-        left: Ranges not sent yet.
-        running: (actor, range) by Ray reference; the range is None while the actor starts.
-        failures: How often each range has ended its actor; of None, how often an actor has failed to start.
-    """
-
-    def __init__(self, pool, job, ranges):
-        self.pool, self.ray, self.job = pool, pool.ray, job
-        self.runner = self.ray.put(job.runner())
-        self.left, self.running = deque(ranges), {}
-        self.failures: dict = {}
-        self.actors: list = []
-
-    def start_actor(self):
-        on_gpus = self.pool.on_gpus
-        share = {"num_gpus": 1, "num_cpus": 0} if on_gpus else {"num_cpus": 1}
-        actor = self.ray.remote(_Actor).options(**share).remote(self.runner, "cuda:0" if on_gpus else "cpu")
-        self.actors.append(actor)
-        self.running[actor.ready.remote()] = actor, None
-
-    def send(self, actor):
-        """Send the next shard to an actor."""
-        if self.left:
-            part = self.left.popleft()
-            self.running[actor.run.remote(self.job.task(*part))] = actor, part
-
-    def replace_actor(self, actor, cause):
-        """Take back the shards of an actor that ended, and start another."""
-        self.pool.lost += 1
-        self.pool.pids.pop(actor, None)
-        self.kill(actor)  # it may be alive if its machine was disconnected
-        self.actors.remove(actor)
-        lost = [reference for reference, (owner, _) in self.running.items() if owner is actor]
+    def _take_back(self, actor, cause):
+        """Take back the shards of an actor that ended."""
+        self.lost += 1
+        self.pids.pop(actor, None)
+        self._kill(actor)  # it may be alive if its machine was disconnected
+        self._actors.remove(actor)
+        lost = [reference for reference, (owner, _) in self._running.items() if owner is actor]
         # Only the first can have ended the actor; the others were queued behind it.
         for place, reference in enumerate(lost):
-            part = self.running.pop(reference)[1]
+            part = self._running.pop(reference)[1]
             if place == 0:
-                self.failures[part] = self.failures.get(part, 0) + 1
-                if self.failures[part] == ATTEMPTS:
+                self._failures[part] = self._failures.get(part, 0) + 1
+                if self._failures[part] == ATTEMPTS:
                     what = "workers do not start" if part is None else f"shard {part} ended its worker"
                     raise RuntimeError(f"{what}, {ATTEMPTS} times: {cause}")
             if part is not None:
-                self.left.appendleft(part)
-        self.start_actor()
+                self._left.appendleft(part)
 
-    def results(self):
-        """Yield (start, stop, columns) of each shard, in order of completion."""
-        ray = self.ray
-        for _ in range(min(self.pool.workers, len(self.left))):
-            self.start_actor()
-        while self.left or any(part is not None for _, part in self.running.values()):
-            done, _ = ray.wait(list(self.running), num_returns=1)
-            actor, part = self.running[done[0]]
-            try:
-                answer = ray.get(done[0])
-            except ray.exceptions.RayTaskError as error:
-                raise error.cause from None
-            except (ray.exceptions.RayActorError, ray.exceptions.ObjectLostError) as error:
-                self.replace_actor(actor, " ".join(str(error).split())[:300])
-                continue
-            del self.running[done[0]]
-            if part is None:
-                self.pool.pids[actor] = answer
-                self.failures.pop(None, None)
-                for _ in range(AHEAD):
-                    self.send(actor)
-                continue
-            self.send(actor)
-            del done  # Ray frees the answer with its last reference
-            yield *part, answer
-
-    def kill(self, actor):
+    def _kill(self, actor):
         with contextlib.suppress(Exception):
             self.ray.kill(actor)

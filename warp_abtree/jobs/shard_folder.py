@@ -34,10 +34,8 @@ class DamagedShard(ValueError):
 class ShardFolder:
     """The folder of one job.
 
-    Attributes:
-        left: Ranges still to be computed, in order, as keys.
-        damaged: Ranges whose file is damaged; they are in `left` too.
-        intersecting: Poses that intersect, in the shards that were checked or written.
+    `left` has the ranges that are still to be computed, in order, as keys, `damaged` those of them whose file is
+    damaged; `intersecting` counts poses that intersect, in the shards that were checked or written.
     """
 
     def __init__(self, out, job):

@@ -19,7 +19,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import finite_array, positive, whole_number
 from warp_abtree.checks.device_memory import DeviceMemory
-from warp_abtree.checks.upload import Upload, struct_of
+from warp_abtree.checks.upload import Download, Upload, struct_of
 from warp_abtree.kernels.lod import paper, prediction, tolerance
 from warp_abtree.kernels.lod.ladder import WARP
 from warp_abtree.lod.selection import lod_pool
@@ -74,6 +74,7 @@ class Controller(DeviceMemory):
         lods: LODs last selected, int32 (n,) on the device.
         tests: Tests of the last frame that each object took part in, written by what runs frames; None where the
             controller reads none.
+        chosen: `kernels.lod.prediction.LevelChoice`, what LODs follow from after `choose`; empty where that sets them.
     """
 
     budget_ms: float | None = None
@@ -84,8 +85,8 @@ class Controller(DeviceMemory):
             raise TypeError(f"camera is a {type(camera).__name__}, neither a Camera nor a function of time")
         self.scene, self.camera, self.ladder, self.device = scene, camera, ladder, scene.device
         self.view, self.pool = View(scene, window), lod_pool(ladder, scene)
-        self._ahead: tuple = (math.nan, None)  # a time, and the camera then
-        self.lods = self._zeros(scene.object_count, wp.int32)
+        self._ahead = math.nan  # time of a camera that was brought for the next `prepare`
+        self.lods, self.chosen = self._zeros(scene.object_count, wp.int32), prediction.LevelChoice()
 
     def next_lods(self, feedback: Feedback) -> wp.array:
         """Return the LOD of every object for the coming frame, int32 (n,) on the device, overwritten by the next call.
@@ -107,16 +108,17 @@ class Controller(DeviceMemory):
         `rests` tells whether the selection is left out. Raises RuntimeError as `next_lods`.
         """
         self.view.check()
-        if self._ahead[0] != feedback.time:
+        if self._ahead != feedback.time:
             self.look_ahead(feedback.time)
-        if self.camera is not None:
-            self.view.look(self._ahead[1])
+        self._ahead = math.nan
         if not rests:
             self._update(feedback)
 
     def look_ahead(self, time: float):
-        """Find the camera of the next `prepare`, as while the device works on a frame."""
-        self._ahead = time, self.camera(time) if callable(self.camera) else self.camera
+        """Bring the camera of the next `prepare` to the device, behind what was launched."""
+        if self.camera is not None:
+            self.view.look(self.camera(time) if callable(self.camera) else self.camera)
+        self._ahead = time
 
     def launch(self, rests: bool = False):
         """Measure the view as the camera and the objects stand, and select LODs unless it rests. Launches only."""
@@ -124,6 +126,10 @@ class Controller(DeviceMemory):
             self.view.launch()
         if not rests:
             self._select()
+
+    def choose(self, rests: bool = False):
+        """Do what `launch` does, but leave it to the frame's own kernel to set what follows from `chosen`."""
+        self.launch(rests)
 
     def _select(self):
         raise NotImplementedError
@@ -221,7 +227,7 @@ class PredictiveController(Controller):
     positions as candidates. It predicts their tests from the last frame's tests of every object and the faces it would
     have (tests grow as a power of the faces, with a fitted exponent), and the nodes refitted, of models whose levels do
     not all have tree states; with the recent rates of this machine it takes the finest position that keeps the budget
-    (`choose_position_kernel`).
+    (`choose_position`).
 
     Args:
         scene, camera, window: As in `Controller`.
@@ -235,7 +241,7 @@ class PredictiveController(Controller):
     Attributes:
         rate: See the RATE constants of `kernels.lod.prediction`, float64 (5,) on the device; NaN at first: no change.
         tests: int64 (n,) on the device.
-        choice: See `choose_position_kernel`, float64 (6,) on the device.
+        choice: See `choose_position`, float64 (6,) on the device.
         scale: Position, and frames that a change has been held, int32 (2,) on the device.
         offset: Positions by which each object is loosened, int32 (n,) on the device.
         changes: Change of the position of each candidate; the last leaves every object at its level.
@@ -273,18 +279,28 @@ class PredictiveController(Controller):
         self._rates.send([math.nan] * 5)
         powers = dict.fromkeys(("power_up", "power_down"), np.zeros(self.ladder.lod.size))
         sums = dict.fromkeys(("work", "nodes"), np.zeros(len(self.changes)))
-        given = {"change": self.changes, "rate": self._rates.array}
+        given = {"change": self.changes, "rate": self._rates.array, "ended": [0]}
         self.prediction = struct_of(prediction.Prediction, self.device, **given, **powers, **sums)
         self.rate, count = self.prediction.rate, len(self.lods)
         self.tests, self.choice = self._zeros(count, wp.int64), self._zeros(6)
-        # Where the host reads the choice when a launch is over.
-        self._chosen = self.choice
-        if self.device.is_cuda:
-            self._chosen = wp.zeros(6, dtype=wp.float64, device="cpu", pinned=True)
+        self._told = Download(6, wp.float64, self.device)  # the choice, for the host
         self.scale, self.offset = self._zeros(2, wp.int32), self._zeros(count, wp.int32)
         self.level = self._zeros(count, wp.int32)
+        self.chosen = self._make_chosen()
         self._query, self._refine, self._rest = CostFit(), CostFit(), CostFit()
         self._exponent, self._drift = 1.0, 0.0
+
+    def _make_chosen(self):
+        made = prediction.LevelChoice()
+        made.held, made.lods = len(self.changes) - 1, self.pool
+        made.scale, made.choice, made.offset, made.level = self.scale, self.choice, self.offset, self.level
+        return made
+
+    def _limits(self):
+        made = prediction.Limits()
+        made.budget, made.aim, made.low = self.budget_ms, self.aim, self.low
+        made.hold_frames, made.position_max, made.stay = self.hold_frames, self.position_max, len(CLIMBS)
+        return made
 
     @property
     def predicted_ms(self) -> float:
@@ -300,7 +316,7 @@ class PredictiveController(Controller):
         """Return what the last launch chose. Waits for the device."""
         if self.device.is_cuda:
             wp.synchronize_stream(wp.get_stream(self.device))
-        return self._chosen.numpy()
+        return self._told.view
 
     def _update(self, feedback):
         if feedback.tests is None:
@@ -332,19 +348,25 @@ class PredictiveController(Controller):
         self._drift += 0.2 * (min(max(found, -0.2), 0.2) - self._drift)
         self._drift = max(self._drift, 0.0)
 
-    def _select(self):
-        predicted, pool, count, candidates = self.prediction, self.pool, len(self.lods), len(self.changes)
-        dim = max(count, candidates, len(predicted.power_up))
-        inputs = self.loosest, pool, self.view.focus, predicted, self.offset
+    def launch(self, rests: bool = False):
+        """Do what `Controller.launch` does."""
+        self.choose(rests)
+        if not rests:
+            self._launch(prediction.set_level_kernel, len(self.lods), self.chosen, self.lods)
+
+    def choose(self, rests: bool = False):
+        """Measure the view, and choose a position on the tolerance scale. Launches only: two, or one that measures."""
+        if rests:
+            super().launch(rests)
+            return
+        self.view.check()
+        predicted, poses = self.prediction, self.view.batch.objects.pool
+        candidates, dim = len(self.changes), max(len(self.lods), len(self.changes), len(predicted.power_up))
+        seen = self.camera is not None, poses.rotation, poses.position, self.view.arrays
+        inputs = self.loosest, self.pool, *seen, predicted, self.offset
         self._launch(prediction.begin_prediction_kernel, dim, *inputs)
         # On the CPU one thread works anyway.
-        chunks = min(CHUNKS_MOST, -(-count // WARP) * WARP) if self.device.is_cuda else WARP
-        share = full_refit_fraction(self.device)
-        now = self.scale, self.offset, self.level, self.tests
-        self._launch(prediction.predict_kernel, (candidates, chunks), chunks, share, pool, *now, predicted)
-        limits = self.budget_ms, self.aim, self.low, self.hold_frames, self.position_max, len(CLIMBS)
-        self._launch(prediction.choose_position_kernel, 1, *limits, predicted, self.scale, self.choice)
-        place = self.scale, self.offset, self.choice, self.level, self.lods
-        self._launch(prediction.set_level_kernel, count, candidates - 1, pool, *place)
-        if self.device.is_cuda:
-            wp.copy(self._chosen, self.choice)
+        chunks = min(CHUNKS_MOST, -(-len(self.lods) // WARP) * WARP) if self.device.is_cuda else WARP
+        share, told = full_refit_fraction(self.device), self._told.array
+        costs = chunks, share, self.tests, self._limits(), predicted, self.chosen, told
+        self._launch(prediction.predict_kernel, (candidates, chunks), *costs)

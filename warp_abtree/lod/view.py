@@ -100,6 +100,7 @@ class View:
         distance: alpha, from the eye to the middle of the object [world units], float64 (n,) on the device.
         motion: gamma, length of its path on the screen over the last `window` launches [pixels], float64 (n,);
             positions behind the camera add nothing.
+        arrays: `kernels.lod.view.ViewArrays`.
         focus: f = min((D - alpha) / D, (W - gamma) / W) within [0, 1], float64 (n,); 1 before any camera.
     """
 
@@ -114,14 +115,14 @@ class View:
 
         self.distance, self.motion = zeros(count), zeros(count)
         self.focus = wp.full(count, 1.0, dtype=wp.float64, device=self.device)
-        self._arrays = kernels.ViewArrays()
-        self._arrays.window = self.window
-        self._arrays.object_model = wp.array(np.array(scene.object_model, np.int32), dtype=wp.int32, device=self.device)
-        self._arrays.centre = self.batch.models.pool.centre
+        self.arrays = kernels.ViewArrays()
+        self.arrays.window = self.window
+        self.arrays.object_model = wp.array(np.array(scene.object_model, np.int32), dtype=wp.int32, device=self.device)
+        self.arrays.centre = self.batch.models.pool.centre
         self._camera = Upload(15, self.device)
-        self._arrays.camera, self._arrays.frame = self._camera.array, zeros(count, wp.int32)
-        self._arrays.screen, self._arrays.path = zeros(count, wp.vec3d), zeros(self.window * count)
-        self._arrays.distance, self._arrays.motion, self._arrays.focus = self.distance, self.motion, self.focus
+        self.arrays.camera, self.arrays.frame = self._camera.array, zeros(count, wp.int32)
+        self.arrays.screen, self.arrays.path = zeros(count, wp.vec3d), zeros(self.window * count)
+        self.arrays.distance, self.arrays.motion, self.arrays.focus = self.distance, self.motion, self.focus
 
     def look(self, camera: Camera):
         """Set the camera from the next launch on; a captured graph reads it at every launch."""
@@ -135,5 +136,5 @@ class View:
         """Measure, in one launch; raise RuntimeError where the scene's objects changed."""
         self.check()
         pool = self.batch.objects.pool
-        inputs = [pool.rotation, pool.position, self._arrays]
+        inputs = [pool.rotation, pool.position, self.arrays]
         wp.launch(kernels.measure_view_kernel, dim=len(self.focus), inputs=inputs, device=self.device)

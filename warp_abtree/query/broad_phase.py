@@ -89,6 +89,9 @@ class TileSearch:
     Args:
         broad_phase: `BroadPhase`.
         group: Group of each object, NumPy int32 (n,).
+
+    Attributes:
+        in_order: Whether it lists pairs in their order, where that is asked.
     """
 
     def __init__(self, broad_phase: "BroadPhase", group: np.ndarray):
@@ -96,7 +99,9 @@ class TileSearch:
         self.tiles, self._lanes = box_tiles.Tiles(), WARP_SIZE if broad_phase.device.is_cuda else 1
         order, most = np.argsort(group, kind="stable").astype(np.int32), 1
         others = count_others(group[order], self._lanes, broad_phase.filter.shared_group)
-        self.sorts = others.sum() > current_regime().tile_tasks
+        self.sorts, shared = others.sum() > current_regime().tile_tasks, broad_phase.filter.shared_group >= 0
+        # Objects of every world meet those of others in no order.
+        self.in_order = broad_phase.sorts and not self.sorts and not (shared and (np.diff(order) < 0).any())
         if not self.sorts:
             self.tiles.order = wp.array(order, dtype=wp.int32, device=self.device)
         else:
@@ -111,6 +116,13 @@ class TileSearch:
         boxed = self._tile_count if self.sorts else 0
         self.tiles.lower = wp.empty(boxed, dtype=wp.vec3, device=self.device)
         self.tiles.upper = wp.empty(boxed, dtype=wp.vec3, device=self.device)
+        if self.in_order:
+            starts = np.concatenate([[0], np.cumsum(others)])
+            self.tiles.place = wp.array(np.argsort(order), dtype=wp.int32, device=self.device)
+            self.tiles.task = wp.array(starts, dtype=wp.int32, device=self.device)
+            self.tiles.meets = wp.zeros(len(self._tasks) * self._lanes, dtype=wp.int32, device=self.device)
+            counts = count + -(-count // int(box_tiles.COUNT_CHUNK))
+            broad_phase.bounds.first_count = wp.zeros(counts, dtype=wp.int32, device=self.device)
 
     def make(self, launch) -> list:
         """Make the launches that find pairs of boxes."""
@@ -127,7 +139,11 @@ class TileSearch:
         pool = found.batch.objects.pool
         inputs = [self._tasks, found.filter, self.tiles, pool, found.bounds, found.pairs]
         dim = self._lanes * len(self._tasks)
-        return [*made, launch(box_tiles.find_tile_pair_kernel, dim=dim, inputs=inputs, **warps)]
+        made.append(launch(box_tiles.find_tile_pair_kernel, dim=dim, inputs=inputs, **warps))
+        if self.in_order:
+            inputs = [self._tasks, self.tiles, found.bounds, found.pairs, found.key]
+            made.append(launch(box_tiles.list_tile_pair_kernel, dim=self._lanes * count, inputs=inputs, **warps))
+        return made
 
     def launch(self, launches: list):
         """Launch what boxes the objects, and what `make` made, with a sort between them."""
@@ -150,6 +166,8 @@ class SweepSearch:
     Args:
         broad_phase, group: As for `TileSearch`.
     """
+
+    in_order = False
 
     def __init__(self, broad_phase: "BroadPhase", group: np.ndarray):
         self._broad_phase, self.sweep, count = proxy(broad_phase), box_sweep.Sweep(), len(group)
@@ -185,8 +203,8 @@ class BroadPhase(DeviceMemory):
 
     Attributes:
         pairs: (i, j), i < j, device vec2i (capacity,).
-        key: i * 2^32 + j of each pair where they are sorted, device int64 (2 capacity,); the greatest int64 behind the
-            last pair.
+        key: i * 2^32 + j of each pair where they are sorted, device int64 (capacity,) or more; behind the last pair the
+            greatest int64.
         boxes: As given.
         bounds: Boxes of the last launch, `kernels.intersect.broad_phase.PosedBounds`.
         filter: Which objects may be a pair, `kernels.intersect.broad_phase.PairFilter`.
@@ -214,10 +232,10 @@ class BroadPhase(DeviceMemory):
         self.bounds.upper = wp.zeros(count, dtype=wp.vec3, device=device)
         self.bounds.pair_count = wp.zeros(1, dtype=wp.int32, device=device)
         self.guard = guard or LaunchGuard(device, batch.states.generation, batch.filter_generation)
-        self.resize(capacity or max(64, 4 * count))
         self._commands = Commands()
         self.search: TileSearch | SweepSearch
         self.search = (TileSearch if current_regime().uses_warps(device) else SweepSearch)(self, group)
+        self.resize(capacity or max(64, 4 * count))
 
     @property
     def lower(self) -> wp.array:
@@ -242,16 +260,19 @@ class BroadPhase(DeviceMemory):
     def make_arrays(self, capacity: int) -> list:
         """Return (owner, attribute, new array) of a list of pairs and of what sorts them."""
         made = [(self, "pairs", wp.empty(capacity, dtype=wp.vec2i, device=self.device))]
-        # The sort takes as much again as scratch.
-        for name, dtype in {"key": wp.int64, "order": wp.int32}.items() if self.sorts else ():
-            made.append((self, name, wp.empty(2 * capacity, dtype=dtype, device=self.device)))
+        if self.sorts and self.search.in_order:
+            made.append((self, "key", wp.empty(capacity, dtype=wp.int64, device=self.device)))
+        elif self.sorts:
+            # The sort takes as much again as scratch.
+            for name, dtype in {"key": wp.int64, "order": wp.int32}.items():
+                made.append((self, name, wp.empty(2 * capacity, dtype=dtype, device=self.device)))
         return made
 
     def launch(self):
         """Box, search, and sort if asked. Launches only, so that a graph can capture it."""
         given = *self.guard.given(), self.pairs.ptr, self.boxes.given()
         self.search.launch(self._commands.find_callables("pairs", given, self.device, self._make_launches))
-        if self.sorts:
+        if self.sorts and not self.search.in_order:
             self._sort()
 
     def _sort(self):

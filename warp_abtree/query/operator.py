@@ -18,10 +18,9 @@ from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
-from warp_abtree.kernels.search.make_slabs import make_slab_kernel
 from warp_abtree.query.broad_phase import BroadPhase, PosedBoxes
 from warp_abtree.query.commands import Commands
-from warp_abtree.query.readout import Readout, readout_kernels
+from warp_abtree.query.readout import Readout, operator_kernels
 from warp_abtree.query.request import LIST_MAX, check_capacity, check_pair_room, more_room
 from warp_abtree.query.result import Found, Result
 from warp_abtree.query.stage import Array, PairDistance, Rooms, Stage
@@ -30,15 +29,6 @@ from warp_abtree.state.generation import LaunchGuard
 
 # Face pairs that the float32 stage leaves uncertain: about one in a hundred. The list grows as needed.
 UNCERTAIN_ROOM = 65536
-
-
-def operator_kernels(device, stages, output: str) -> list:
-    """Return the kernels of the first launch of an operator with these stages, as `loading` takes them."""
-    regime = current_regime()
-    found = [kernel for stage in stages for kernel in stage.kernels(device)]
-    if regime.uses_warps(device) and regime.slabs:
-        found.append((make_slab_kernel, 256))
-    return [*found, *readout_kernels(device, output)]
 
 
 class Operator(DeviceMemory):
@@ -67,6 +57,7 @@ class Operator(DeviceMemory):
     near: Any = None
     hits: Any
     lists_apart = False  # whether warps list all face pairs that are apart and may be near
+    parts: Any = None  # `PointParts` where parts of the pairs take turns in lists of their own
     counts: wp.array
     traversal: Any
     lists_hits = False
@@ -170,9 +161,14 @@ class Operator(DeviceMemory):
         rooms = Rooms(*(now if wanted is None else wanted for wanted, now in asked))
         self._replace(self._make(rooms), rooms)
 
-    def resize(self, capacity: int):
-        """Make room for a number of intersecting face pairs."""
-        self.make_room(hits=capacity)
+    @property
+    def list_rooms(self) -> Rooms:
+        """Return the room of the lists that hits are found in."""
+        return self.rooms
+
+    def make_list_room(self, hits: int | None = None, uncertain: int | None = None):
+        """Make room for longer lists, as `make_room`."""
+        self.make_room(hits=hits, uncertain=uncertain)
 
     def _replace(self, made: list, rooms: Rooms):
         """Put new arrays, (owner, attribute, array), in the place of old ones."""
@@ -274,12 +270,15 @@ class Operator(DeviceMemory):
 
     def search(self):
         """Search the pairs in place. Launches only, after making room for tree states that are new."""
-        if not self.rooms.pairs:
-            return
+        if self.rooms.pairs:
+            self.fit_states()
+            for search in self._searches:
+                search()
+
+    def fit_states(self):
+        """Make room for tree states that are new, unless a graph is being captured."""
         if self._fitted and not self.device.is_capturing and not all(fits() for fits in self._fitted):
             self.make_room()
-        for search in self._searches:
-            search()
 
     def report(self, count: int | None = None):
         """Compute further outputs of the hits, of which there are so many; None: all that have room. Launches only."""
@@ -361,8 +360,8 @@ class Operator(DeviceMemory):
                 self.launch_search()
                 found = read()
             found = self._grow_uncertain(read, found)
-            if found.totals.hits > self.rooms.hits:
-                self.resize(self.growth * found.totals.hits)
+            while found.totals.hits > self.list_rooms.hits:
+                self.make_list_room(hits=self.growth * found.totals.hits)
                 self.search()
                 found = read()
             self.report(found.totals.hits)
@@ -376,8 +375,8 @@ class Operator(DeviceMemory):
 
     def _grow_uncertain(self, read, found: Found) -> Found:
         # How many wait varies for `any`, where the first hit of a pair ends its traversal.
-        while 0 < self.rooms.uncertain < min(LIST_MAX, found.totals.uncertain):
-            self.make_room(uncertain=more_room(found.totals.uncertain))
+        while 0 < self.list_rooms.uncertain < min(LIST_MAX, found.totals.uncertain):
+            self.make_list_room(uncertain=more_room(found.totals.uncertain))
             self.search()
             found = read()
         return found

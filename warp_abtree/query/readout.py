@@ -11,6 +11,7 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.io import results as kernels
+from warp_abtree.kernels.search.make_slabs import make_slab_kernel
 from warp_abtree.query.request import APART_FOR_UNCERTAIN
 from warp_abtree.query.result import COUNTERS, Found, Result, Totals
 from warp_abtree.query.sorting import HitSort, first_sort, sort_rows
@@ -28,11 +29,15 @@ def waiting_demand(operator: Any, apart: int, uncertain: int) -> int:
     return max(apart, uncertain * (APART_FOR_UNCERTAIN if operator.lists_apart else 1))
 
 
-def readout_kernels(device, output: str) -> list:
-    """Return the kernels of the first readout, see `loading`."""
-    if not current_regime().packs(device):
-        return []
-    return [(kernels.pack_pair_kernel, kernels.BLOCK_DIM), *(first_sort(device) if output == "faces" else [])]
+def operator_kernels(device, stages, output: str) -> list:
+    """Return the kernels of the first launch of an operator with these stages, as `loading` takes them."""
+    regime = current_regime()
+    found = [kernel for stage in stages for kernel in stage.kernels(device)]
+    if regime.uses_warps(device) and regime.slabs:
+        found.append((make_slab_kernel, 256))
+    if regime.packs(device):
+        found += [(kernels.pack_pair_kernel, kernels.BLOCK_DIM), *(first_sort(device) if output == "faces" else [])]
+    return found
 
 
 class HostViews:
@@ -108,7 +113,7 @@ class Readout:
             operator.guard.check(found.totals.launched)
         for read in operator.readers:
             read(found, device, with_rows)
-        return Result(found, operator.rooms, operator.output, operator.batch.names)
+        return Result(found, operator.list_rooms, operator.output, operator.batch.names)
 
     def read_totals(self) -> Totals:
         """Read what the last launch needed of each list. Waits for the device."""
@@ -116,23 +121,27 @@ class Readout:
         if self.packs:
             return self._totals(self.staging.fetch_words(self._pack_pairs(0), HEADER))
         views, hits = self.views, operator.hits
-        total = int(views.counts[0].sum()) if operator.output == "faces" else 0
-        waiting = int(views.counts[FLOAT64_ROW].sum()) if operator.rooms.uncertain else 0
-        # Counters that overflowed are read as uint32.
-        counters = (hits.apart_total, hits.witness_total)
-        read = (0 if count is None else int(count.numpy().view(np.uint32)[0]) for count in counters)
-        return self._totals([operator.guard.outcome(), int(views.pair_count[0]), total, waiting, *read])
+        apart, witnesses = self._read_count(hits.apart_total), self._read_count(hits.witness_total)
+        lists = int(views.counts[0].sum()), int(views.counts[FLOAT64_ROW].sum()), apart, witnesses
+        return self._totals([operator.guard.outcome(), int(views.pair_count[0]), *lists])
 
     def read_demand(self) -> Found:
         """Read `read_totals` alone of what was found. Waits for the device."""
         return Found(totals=self.read_totals())
 
+    @staticmethod
+    def _read_count(count) -> int:
+        """Return a counter, read as uint32; 0 where there is none. Waits for the device."""
+        return 0 if count is None else int(count.numpy().view(np.uint32)[0])
+
     def _totals(self, header) -> Totals:
         """Return the demands in a header; those of lists that the operator lacks are 0."""
         launched, found, total, uncertain, apart, witnesses = map(int, header[:HEADER])
-        operator = self.operator
+        operator, hits = self.operator, self.operator.hits
+        if operator.parts is not None:  # the lists have held those of one part at a time
+            total, uncertain = self._read_count(hits.total), self._read_count(hits.uncertain_total)
         pairs = len(operator.given) if operator.broad_phase is None else operator.broad_phase.check_found(found)
-        demand = waiting_demand(operator, apart, uncertain) if operator.rooms.uncertain else 0
+        demand = waiting_demand(operator, apart, uncertain) if operator.list_rooms.uncertain else 0
         return Totals(launched, pairs, max(total, witnesses) if operator.output == "faces" else 0, demand)
 
     def read_pairs(self, device: bool) -> Found:

@@ -35,7 +35,7 @@ class CapacityError(RuntimeError):
 ROOM_MORE = 2**24
 
 # Where all face pairs that may be near are listed, those that are uncertain have this part of the room.
-APART_FOR_UNCERTAIN = 2
+APART_FOR_UNCERTAIN = 4
 
 
 def more_room(demand: int) -> int:

@@ -11,7 +11,8 @@ from warp_abtree.checks.kernel_loading import loading, of_first_query
 from warp_abtree.kernels.base.nodes import clear_node_kernel
 from warp_abtree.kernels.io.place_poses import pose_setter
 from warp_abtree.query.broad_phase import broad_phase_kernels
-from warp_abtree.query.operator import Operator, operator_kernels
+from warp_abtree.query.operator import Operator
+from warp_abtree.query.readout import operator_kernels
 from warp_abtree.query.request import SCENE_OPTIONS, check_options, check_within, refuse_signed
 from warp_abtree.query.result import Result
 from warp_abtree.query.stages.contacts import ContactQuery

@@ -10,6 +10,7 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.kernels.io import pipeline as kernels
+from warp_abtree.kernels.update.levels import Levels
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.request import CapacityError, check_capacity
 from warp_abtree.query.result import Result
@@ -63,14 +64,13 @@ class Pipeline(DeviceMemory):
     which the broad phase found them. No launch waits for the host, and their number depends on nothing but how many
     states there are and how deep their trees (at most 31 levels):
 
-    * 1 for poses;
-    * 3 for LODs; 4 more where there are trees that no block of threads takes (on CUDA from 4,096 faces on, or as many
+    * 1 for poses, and for levels with a ladder;
+    * 1 for LODs; 6 more where there are trees that no block of threads takes (on CUDA from 8,192 faces on, or as many
       times more as there are more states than multiprocessors; from 65,536 on always), and then 1 for each level on
-      which their states together have more than 1,024 nodes; 1 with a ladder;
+      which their states together have more than 1,024 nodes; none with a ladder;
     * 2 for the broad phase, on CUDA 4 more and a sort where a world has many hundreds of objects; none for given pairs;
     * 2 for the narrow phase on the CPU (outside a graph one of them once a core), 4 on CUDA (3 without exact signs), 2
-      more with `within`; for contacts those of `ContactQuery`;
-    * 1 that keeps the greatest demand.
+      more with `within`; for contacts those of `ContactQuery`.
 
     The frame takes the scene's models, objects, poses, LODs and filter as they are when it is made. States and objects
     are its own: it leaves the scene as it is, and what happens to the scene later does not reach it.
@@ -115,13 +115,14 @@ class Pipeline(DeviceMemory):
         else:
             self._update = self._make_ladder(scene.lods, ladder, scene.models)
         self.lods = self._update.wanted
+        self._levels = self._update.levels if isinstance(self._update, LevelStates) else Levels()
         plan = self._update.plan
         self.changed_count = None if plan is None else plan.changed_count
         self.marked_count = None if plan is None else plan.marked_count
         self.poses = wp.empty((batch.object_count, 7), dtype=wp.float64, device=self.device)
         wp.launch(kernels.read_pose_kernel, len(self.poses), [batch.objects.pool, self.poses], device=self.device)
         self._bad_poses = wp.empty(2, dtype=wp.int32, device=self.device)
-        self._demand = wp.zeros(4, dtype=wp.int64, device=self.device)
+        self._demand = wp.zeros(5, dtype=wp.int64, device=self.device)
         make: Any = ContactQuery if output == "contacts" else partial(Query, output=output)
         self.query: Operator = make(batch, **request)
         # Loads the kernels, and tells what the poses as they stand take.
@@ -146,7 +147,7 @@ class Pipeline(DeviceMemory):
     def _fit_uncertain(self, capacity):
         """Make room for the uncertain face pairs, unless that room was given; then say what it lacks."""
         given = check_capacity(capacity).uncertain
-        needed, room = int(self._demand.numpy()[2]), len(self.query.hits.uncertain)
+        needed, room = int(self._read_demand()[2]), len(self.query.hits.uncertain)
         if not 0 < room < needed:
             return
         if given is None:
@@ -167,14 +168,23 @@ class Pipeline(DeviceMemory):
         with self.query.guard.launching(self):
             self._set_objects()
             self.query.launch()
-            inputs = [self.query.pair_batch, self.query.hits, self._demand]
-            wp.launch(kernels.tally_demand_kernel, 1, inputs, device=self.device)
 
     def _set_objects(self):
-        record = self.query.guard.record()
-        inputs = [QUATERNION_TOLERANCE, self.poses, self.batch.objects.pool, self._bad_poses, record]
-        wp.launch(kernels.place_object_kernel, len(self.poses), inputs, device=self.device)
-        self._update.launch()
+        update, query = self._update, self.query
+        inputs = [QUATERNION_TOLERANCE, self.poses, query.pair_batch, query.hits, self._demand, self._levels]
+        inputs += [self.batch.objects.pool, self._bad_poses, query.guard.record()]
+        place = partial(wp.launch, kernels.begin_pipeline_kernel, len(self.poses), inputs, device=self.device)
+        if isinstance(update, LevelStates):
+            update.launch(place)
+        else:
+            place()
+            update.launch()
+
+    def _read_demand(self) -> np.ndarray:
+        """Return the greatest demand, that of the last launch included. Waits for the device."""
+        inputs = [self.query.pair_batch, self.query.hits, self._demand]
+        wp.launch(kernels.tally_demand_kernel, 1, inputs, device=self.device)
+        return self._demand.numpy()
 
     def capture(self) -> wp.Graph:
         """Return `launch()` as a graph for `wp.capture_launch`; it holds as long as the frame does and no buffer grows.
@@ -201,6 +211,7 @@ class Pipeline(DeviceMemory):
         with self.query.guard.launching(self):
             self._set_objects()
             result = self.query.run()
+            self._demand[4:].zero_()  # what was too small has grown
         self.check()
         return result
 
@@ -223,8 +234,8 @@ class Pipeline(DeviceMemory):
                 and whatever else was wrong.
         """
         check_device(self.device, "Pipeline.check")
-        poses, lods, demand = self._bad_poses.numpy().copy(), self._update.faults.numpy().copy(), self._demand.numpy()
-        found, hits, uncertain, stale = (int(value) for value in demand)
+        poses, lods, demand = self._bad_poses.numpy().copy(), self._update.faults.numpy().copy(), self._read_demand()
+        found, hits, uncertain, stale = (int(value) for value in demand[:4])
         self.clear_faults()
         wrong, lost = [], []
         if poses[0]:
@@ -242,9 +253,9 @@ class Pipeline(DeviceMemory):
             room["hits"] = hits, len(self.query.hits.face)
         if len(self.query.hits.uncertain):
             room["uncertain"] = uncertain, len(self.query.hits.uncertain)
-        for name, (demand, places) in room.items():
-            if demand > places:
-                needed = f"Buffers({name}={demand})"
+        for name, (needs, places) in room.items():
+            if needs > places:
+                needed = f"Buffers({name}={needs})"
                 lost.append(f"a frame since the last check needed {needed}, the pipeline has room for {places}")
         if stale:
             stale_frame = f"a frame since the last check is lost: its graph {STALE_GRAPH}"

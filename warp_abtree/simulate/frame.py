@@ -189,9 +189,8 @@ class Frame(DeviceMemory):
             launch = launches.append if captures else call
             stages = self._select(stages, frame, captures)
             launch(partial(stages.select, frame.rests))
-            launch(partial(stages.refine, frame.rests))
             places = stages.bring_poses(frame.time)
-            launch(partial(stages.move, places))
+            launch(partial(stages.arrange, frame.rests, places))
             launch(stages.find)
             launch(stages.respond)
             if captures:
@@ -207,7 +206,7 @@ class Frame(DeviceMemory):
         if frame.is_short or not stages.has_room(found):
             frame.is_short = True
             stages.grow()
-            stages.respond()
+            stages.respond_again()
             found = stages.summary()
             frame.is_short = False
         stages.finish_bodies()

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.upload import Upload
+from warp_abtree.checks.upload import Download, Upload
+from warp_abtree.kernels.io import pipeline as arranging
 from warp_abtree.kernels.lod import frame_summary
 from warp_abtree.kernels.lod.ladder import WARP
-from warp_abtree.kernels.update import levels as level_kernels
-from warp_abtree.kernels.update import work_lists
+from warp_abtree.kernels.lod.prediction import LevelChoice
+from warp_abtree.kernels.update.levels import Levels
 from warp_abtree.lod.controllers import Controller
 from warp_abtree.query.readout import waiting_demand
 from warp_abtree.query.stages.contacts import ContactQuery
@@ -22,7 +23,7 @@ from warp_abtree.simulate.frame_row import LodColumns
 from warp_abtree.simulate.motion import Kinematic
 from warp_abtree.simulate.rigid_bodies import SteppedMotion
 from warp_abtree.state.device_update import LevelStates, shares_levels
-from warp_abtree.state.poses import check_poses, launch_place
+from warp_abtree.state.poses import check_poses
 
 # Words of `kernels.lod.frame_summary` by name, in their order.
 WORDS = (
@@ -56,7 +57,7 @@ class FrameStages:
         self._stepped = motion if isinstance(motion, SteppedMotion) else None
         self.answer, self._find_poses = getattr(motion, "answer", None), getattr(motion, "poses", None)
         self._memory = np.empty((scene.object_count, 7))
-        self._ahead: tuple = (None, None)  # a time, and the poses then
+        self._ahead: tuple = (None, False)  # a time, and whether poses of it were brought
         self._dynamics = None if self._stepped is None else self._stepped.dynamics
         if self._dynamics is None:
             contacts = output == "contacts"
@@ -72,27 +73,24 @@ class FrameStages:
         zeros = partial(wp.zeros, device=self.device)
         self._levels: Any = None
         self.table: Any = None
-        self._marked = self._count = zeros(0, wp.int32)
-        self._changed, self._tests = zeros(2, wp.int32), zeros(0, wp.int64)
+        self._marked = self._count = self._change = zeros(0, wp.int32)
+        self._tests = zeros(0, wp.int64)
         if controller is not None:
             self._serve(controller)
         self._upload = Upload(self._memory.size, self.device)
         self._rows = self._upload.array.reshape((-1, 7))
-        self._frames, self._summary = zeros(1, wp.int64), zeros(len(WORDS) + len(self._count), wp.int64)
-        self._host_summary = self._summary
-        if self.device.is_cuda:
-            self._host_summary = wp.zeros(len(self._summary), dtype=wp.int64, device="cpu", pinned=True)
+        self._sums, self._ended = zeros(len(WORDS), wp.int64), zeros(1, wp.int32)
+        self._summary = Download(len(WORDS) + len(self._count), wp.int64, self.device)
 
     def _serve(self, controller):
         """Let objects stand at the levels of a controller's ladder."""
         controller.view.check()  # its ladder is of the models that the scene had
         ladder = controller.ladder.levels()
         shared = shares_levels(self.batch.object_model, ladder)
-        self._levels = made = LevelStates(self.batch, ladder, self.batch.lods, shared)
-        made.wanted = controller.lods
+        self._levels = made = LevelStates(self.batch, ladder, self.batch.lods, shared, controller.lods)
         self.batch.follow(made)
         self.table = LodColumns(self.scene, made.level_model, made.level_lod)
-        self._count, self._changed = made.levels.count, made.levels.changed
+        self._count, self._change = made.levels.count, made.levels.change
         if made.plan is not None:
             self._marked = made.plan.marked_count
         if controller.tests is not None:
@@ -111,8 +109,10 @@ class FrameStages:
         """Load the kernels that no other operator has loaded, and make room for what is found; nothing moves."""
         if self._stepped is not None:
             self._stepped.warm_up(self._time_step)
-        for module in (frame_summary, level_kernels, work_lists):
+        for module in (frame_summary, arranging):
             wp.load_module(module, self.device)
+        if self._levels is not None:
+            self._levels.load()
         self.grow()
 
     def arrays(self) -> tuple:
@@ -121,50 +121,57 @@ class FrameStages:
 
     def bring_poses(self, time: float) -> bool:
         """Bring to the device the poses of a frame that begins at a time [s]; return whether there are any to set."""
-        known, poses = self._ahead
-        self._ahead = None, None
+        known, places = self._ahead
+        self._ahead = None, False
         if known != time:
-            poses = self._poses(time)
+            places = self._send_poses(time)
         if self._stepped is not None:
             self._stepped.aim(time + self._time_step)
-        if poses is not None:
-            self._upload.send(poses.ravel())
-        return poses is not None
+        return places
 
-    def _poses(self, time):
-        """Return checked poses of a time; None if there are none, or the motion has set those of the scene."""
+    def _send_poses(self, time) -> bool:
+        """Bring checked poses of a time to the device; false if there are none, or the motion has set the scene's."""
         poses = None if self._find_poses is None else self._find_poses(time, out=self._memory)
         if poses is None:
-            return None
+            return False
         rows = check_poses(poses, removed=self.scene.batch().removed)
         if rows.shape != self._memory.shape:
             raise ValueError(f"motion: poses of shape {rows.shape}, not {self._memory.shape}")
-        return rows
+        self._upload.send(rows.ravel())
+        return True
 
     def look_ahead(self, time: float):
-        """Do what the host can of a frame that begins at a time to come, as while the device works on this one."""
+        """Do what the host can of a frame that begins at a time to come, behind the launches of this one."""
         if self.controller is not None:
             with suppress(Exception):  # a camera that there is none of raises when its frame comes
                 self.controller.look_ahead(time)
         if isinstance(self.motion, Kinematic):
-            self._ahead = time, self._poses(time)
+            self._ahead = time, self._send_poses(time)
 
     def select(self, rests: bool):
         """Select LODs, if there is a controller, unless all are known to stay after a frame in which they did."""
         if self.controller is not None:
-            self.controller.launch(rests)
+            self.controller.choose(rests)
             self._mark("select_ms", lambda: {"selected": 0 if rests else self.scene.object_count})
 
-    def refine(self, rests: bool):
-        """Bring objects to the LODs selected."""
-        if self.controller is not None and not rests:
-            self._levels.launch()
+    def arrange(self, rests: bool, places: bool):
+        """Bring objects to the LODs selected, and set the poses that were brought, if there are any."""
+        place = partial(self._arrange, rests, places)
+        if self.controller is None or rests:
+            place()
+            return
+        self._levels.launch(place)
+        if self._levels.plan is not None:
             self._mark("refine_ms", lambda: {"node_refitted": int(self._marked.numpy().sum())})
 
-    def move(self, places: bool):
-        """Set the poses that were brought, if there are any."""
-        if places:
-            launch_place(self._rows, self.batch.objects.pool)
+    def _arrange(self, rests: bool, places: bool):
+        controller = None if rests else self.controller
+        if places or controller is not None or len(self._tests):
+            levels = Levels() if controller is None else self._levels.levels
+            chosen = LevelChoice() if controller is None else controller.chosen
+            poses = self._rows if places else self._rows[:0]
+            inputs = [poses, chosen, levels, self.batch.objects.pool, self._tests]
+            wp.launch(arranging.arrange_object_kernel, len(self._rows), inputs, device=self.device)
         self._mark("move_ms", lambda: {"posed": 0 if self.motion is None else self.scene.object_count})
 
     def find(self):
@@ -179,19 +186,20 @@ class FrameStages:
             found = self.summary()
             return {"query": 1, "node_test": found["node_tests"], "triangle_test": found["triangle_tests"]}
 
-        self._summary.zero_()
-        if len(self._tests):
-            self._tests.zero_()
-        query, lengths = self.query, (len(self.query.pairs), len(self._marked), len(self._count), 1)
-        inputs = [query.pair_batch, query.hits, self._marked, self._changed, self._count]
-        inputs += [self._frames, self._tests, self._summary]
-        dim = -(-max(lengths) // WARP) * WARP
+        query, rows = self.query, (self.query.pairs, self._marked, self._count, self._change)
+        dim = -(-max(1, *map(len, rows)) // WARP) * WARP
+        inputs = [query.pair_batch, query.hits, self._marked, self._change, self._count, dim, self._sums]
+        inputs += [self._ended, self._tests, self._summary.array]
         wp.launch(frame_summary.summarise_frame_kernel, dim, inputs, device=self.device)
-        if self.device.is_cuda:
-            wp.copy(self._host_summary, self._summary)
         self._mark("query_ms", count)
         if self._dynamics is not None:
             self._dynamics.answer(self._time_step)
+
+    def respond_again(self):
+        """Do what `respond` does, once more in a frame."""
+        if len(self._tests):
+            self._tests.zero_()
+        self.respond()
 
     def finish_bodies(self):
         """Finish a step of rigid bodies that lacked room, see `Dynamics.finish`."""
@@ -202,12 +210,12 @@ class FrameStages:
         """Return the last frame's WORDS by name, and as `levels` the objects at each level. Waits for the device."""
         if self.device.is_cuda:
             wp.synchronize_stream(wp.get_stream(self.device))
-        values = self._host_summary.numpy()
+        values = self._summary.view
         return {**dict(zip(WORDS, values[: len(WORDS)].tolist())), "levels": values[len(WORDS) :]}
 
     def has_room(self, found: dict) -> bool:
         """Return whether all buffers had room for what a frame has found, of which this is the summary."""
-        query, room = self.query, self.query.rooms.uncertain
+        query, room = self.query, self.query.list_rooms.uncertain
         return (
             found["launched"] >= 0
             and 0 <= found["pairs"] <= len(query.pairs)

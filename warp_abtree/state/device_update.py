@@ -1,12 +1,14 @@
 """LOD updates that the device plans, inside a captured graph: LODs are read there, and no launch waits for the host."""
 
+from collections.abc import Callable
+
 import numpy as np
 import warp as wp
 
 from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.base.arrays import LEVEL_MAX
+from warp_abtree.kernels.update import block_update, work_lists
 from warp_abtree.kernels.update import levels as level_kernels
-from warp_abtree.kernels.update import work_lists
 from warp_abtree.state.arrays import ModelArrays, StateArrays
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.work_lists import WorkLists, block_limits, make_level_lists, partial_limit
@@ -67,8 +69,8 @@ class DeviceLodUpdate(WorkLists):
         super().__init__(plan, blocks, deepest, int(entries.sum()), int(faces.sum()), level_room, device)
 
     def launch(self):
-        """Refine meshes and update trees. Launches only: three, and where there are trees that no block takes four more
-        and one for each level that has much to refit.
+        """Refine meshes and update trees. Launches only: one, where there are trees that no block takes six more, and
+        one for each level that has much to refit.
 
         Where it is interrupted, the next launch refits every state whole.
         """
@@ -82,6 +84,11 @@ class DeviceLodUpdate(WorkLists):
 
     def _launch(self):
         count = len(self.wanted)
+        if self.entry_room + self.face_room == 0:
+            inputs = [self.models.pool, self._scratch, self.splits, self.wanted]
+            inputs += [self.states.pool, self.faults, self.plan]
+            self.launch_blocks(block_update.wanted_update, count, inputs)
+            return
         wp.launch(work_lists.clear_plan_kernel, max(count, int(LEVEL_MAX)), [self.plan], device=self.device)
         inputs = [self.models.pool, self.splits, self.wanted, self.states.pool, self.plan, self.faults]
         wp.launch(work_lists.plan_update_kernel, count, inputs, device=self.device)
@@ -109,6 +116,7 @@ class LevelStates:
         levels: LODs that objects of each model may stand at, rising.
         lods: LOD that each object starts at, int (n,).
         shared: Models whose levels have states, bool (models,); None is all.
+        wanted: What to take for the attribute of this name; None makes one.
 
     Attributes:
         wanted: LOD of each object, device int32 (n,), to be written before a launch; the coarsest level that is not
@@ -120,7 +128,7 @@ class LevelStates:
         plan: `UpdateLists` of states that are updated; None where there are none.
     """
 
-    def __init__(self, batch: Batch, levels, lods, shared=None):
+    def __init__(self, batch: Batch, levels, lods, shared=None, wanted=None):
         self.batch, self.device = batch, batch.device
         model, shared = batch.object_model, np.full(len(levels), True) if shared is None else shared
         starts = np.concatenate([[0], np.cumsum([len(part) for part in levels])])
@@ -134,17 +142,23 @@ class LevelStates:
         serving = made[placed]
         serving[own] = len(beforehand) + np.arange(len(own))
         state_level = np.concatenate([beforehand, placed[own]])
-        wanted = zip(self.level_model[state_level].tolist(), self.level_lod[state_level].tolist())
-        ids = batch.replace_states(list(wanted), serving)
+        asked = zip(self.level_model[state_level].tolist(), self.level_lod[state_level].tolist())
+        ids = batch.replace_states(list(asked), serving)
         self._level_state = np.where(made >= 0, ids[made], -1)
         self._update, self.plan = None, None
         if len(own):
             self._update = DeviceLodUpdate(batch.models, batch.states, ids[len(beforehand) :])
             self.plan = self._update.plan
+        if wanted is None:
+            wanted = wp.array(self.level_lod[placed], dtype=wp.int32, device=self.device)
+        self.wanted = wanted
+        self.faults = wp.array(NO_FAULTS, dtype=wp.int32, device=self.device)
         self.levels = struct_of(
             level_kernels.Levels,
             self.device,
             object_model=model,
+            wanted=self.wanted,
+            faults=self.faults,
             start=starts,
             lod=self.level_lod,
             state=self._level_state,
@@ -152,23 +166,27 @@ class LevelStates:
             direction=0 * placed,
             count=np.bincount(placed, minlength=len(self.level_lod)),
             state_lod=[] if self._update is None else self._update.wanted,
-            changed=[0, 0],
+            change=0 * placed,
         )
-        self.wanted = wp.array(self.level_lod[placed], dtype=wp.int32, device=self.device)
-        self.faults = wp.array(NO_FAULTS, dtype=wp.int32, device=self.device)
 
-    def launch(self):
-        """Bring objects to their levels: one launch, and those of `DeviceLodUpdate` where states are updated."""
+    def launch(self, place: Callable[[], None]):
+        """Bring objects to their levels: those of `place`, and those of `DeviceLodUpdate` where states are updated.
+
+        `place` launches a kernel that calls `place_level` for each object.
+        """
         try:
-            self.levels.changed.zero_()
-            inputs = [self.wanted, self.levels, self.batch.objects.pool, self.faults]
-            wp.launch(level_kernels.place_level_kernel, len(self.wanted), inputs, device=self.device)
+            place()
             if self._update is not None:
                 self._update.launch()
         except BaseException:
             if self.batch.follows(self):
                 self.batch.tear()
             raise
+
+    def load(self):
+        """Load the kernels that update states, by launching them while every state is at its LOD."""
+        if self._update is not None:
+            self._update.launch()
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
         """Return LOD and tree state of every object as the last launch has left them. Waits for the device."""

@@ -19,7 +19,7 @@ TOP_ROOM = 1024
 # On a GPU: faces of a slice, or of a tree, that a block updates where there are fewer states than multiprocessors; with
 # more states, as many times more. Threads of a block: of many states with trees of at most SMALL_DEPTH, and with
 # shallow ones. And blocks of a launch, at most.
-BLOCK_SLICE, BLOCK_FACES = 1024, 4096
+BLOCK_SLICE, BLOCK_FACES = 1024, 8192
 SMALL_DEPTH = 10
 SMALL_THREADS, SHALLOW_THREADS = 64, 256
 BLOCKS_MOST = 8192
@@ -105,19 +105,19 @@ class WorkLists(DeviceMemory):
     def update(self, models, states):
         """Refine meshes and update trees of `ModelPool` and `StatePool`, by blocks and by lists. Launches only."""
         if self.block_room:
-            self._update_by_blocks(models, states)
+            self.launch_blocks(block_update.state_update, self.block_room, [models, self._scratch, states, self.plan])
         refine_meshes(models, states, self)
         active_update(models, states, self)
 
-    def _update_by_blocks(self, models, states):
+    def launch_blocks(self, update, count: int, inputs: list):
+        """Launch the kernel that `update` makes, a block for each of so many states, or fewer that take turns."""
         blocks, threads, shallow = 1, 1, False
         if self.device.is_cuda:
             shallow = self.depth <= block_update.SHALLOW_DEPTH and self.block_room > self.device.sm_count
             few_faces = SMALL_THREADS if self.depth <= SMALL_DEPTH else SHALLOW_THREADS
-            blocks, threads = min(self.block_room, BLOCKS_MOST), few_faces if shallow else block_update.BLOCK_THREADS
-        inputs = [blocks, threads, models, self._scratch, states, self.plan]
-        kernel = block_update.state_update(shallow)
-        wp.launch(kernel, (blocks, threads), inputs, block_dim=threads, device=self.device)
+            blocks, threads = min(count, BLOCKS_MOST), few_faces if shallow else block_update.BLOCK_THREADS
+        inputs = [blocks, threads, *inputs]
+        wp.launch(update(shallow), (blocks, threads), inputs, block_dim=threads, device=self.device)
 
 
 def make_level_lists(plan: UpdateLists, marked_room: list, device):

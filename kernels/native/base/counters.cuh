@@ -55,6 +55,23 @@ inline CUDA_CALLABLE void count_flags(wp::array_t<wp::int64> totals, wp::int32 i
 #endif
 }
 
+inline CUDA_CALLABLE bool ends_launch(wp::array_t<wp::int32> ended, wp::int32 threads) {
+#if defined(__CUDA_ARCH__)
+    // The first lane adds for its warp.
+    if ((threadIdx.x & 31) != 0)
+        return false;
+    __threadfence();
+    if (atomicAdd(ended.data, 1) + 1 != threads / 32)
+        return false;
+    __threadfence();
+#else
+    if (++ended.data[0] != threads)
+        return false;
+#endif
+    ended.data[0] = 0;
+    return true;
+}
+
 inline CUDA_CALLABLE void add_lanes(wp::array_t<wp::int64> totals, wp::int32 i, wp::int64 x) {
 #if defined(__CUDA_ARCH__)
     long long sum = x;

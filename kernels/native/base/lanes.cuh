@@ -75,6 +75,14 @@ inline CUDA_CALLABLE wp::vec_t<6, wp::float64> add_in_order(wp::vec_t<6, wp::flo
 #endif
 }
 
+inline CUDA_CALLABLE wp::int32 warp_sum(wp::int32 x) {
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step >>= 1)
+        x += __shfl_xor_sync(0xffffffffu, x, step);
+#endif
+    return x;
+}
+
 inline CUDA_CALLABLE wp::float64 warp_max(wp::float64 x) {
 #if defined(__CUDA_ARCH__)
     for (int step = 16; step > 0; step >>= 1)

@@ -1,6 +1,7 @@
 """Arguments of the command line: the parser, types of numbers, and completion in shells."""
 
 import argparse
+import contextlib
 import re
 
 from warp_abtree.app.toml.folder import scene_names
@@ -18,7 +19,8 @@ MESHES = 'a mesh file, gzipped or not, or "warp:bunny", "warp:bear", "warp:rocks
 LOD_HELP = "a number with a dot is a fraction of the faces in (0, 1], a whole number a LOD, or tol:X, finest, coarsest"
 PRECISION_NAMES = ("exact", "float32")
 SCENES_FUNCTION = "_warp_abtree_scenes"  # of the completion scripts
-_NEGATIVE = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|^-(inf|nan)$")
+_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_NEGATIVE = re.compile(rf"-({_NUMBER}|inf|nan)$")
 
 
 class Parser(argparse.ArgumentParser):
@@ -30,11 +32,10 @@ class Parser(argparse.ArgumentParser):
     def add_file(self, *names, **options):
         """Add an argument that is a file, which shells complete."""
         action = self.add_argument(*names, **options)
-        try:
+        with contextlib.suppress(ImportError):
             import shtab
-        except ImportError:
-            return action
-        action.complete = shtab.FILE  # type: ignore[attr-defined]
+
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
         return action
 
     def add_scene(self, *names, **options):
@@ -43,6 +44,14 @@ class Parser(argparse.ArgumentParser):
         if hasattr(action, "complete"):
             action.complete = {**action.complete, **dict.fromkeys(("bash", "zsh"), SCENES_FUNCTION)}
             action.complete["fish"] = " ".join(("(__fish_complete_path)", *scene_names()))
+
+    def add_flag(self, name: str, about: str, default: bool | None = False):
+        """Add an option that is true where it is given."""
+        self.add_argument(name, action="store_true", default=default, help=about)
+
+    def add_number(self, name: str, about: str, kind=float, default=None):
+        """Add an option of a number, or of a whole number by `positive_count`."""
+        self.add_argument(name, type=kind, default=default, metavar="X" if kind is float else "N", help=about)
 
     def add_pose(self, about: str, **options):
         """Add `--pose`, a position and a quaternion."""
@@ -68,14 +77,11 @@ def positive_count(text) -> int:
 
 def milliseconds(text) -> float:
     """Return a time above 0, in ms or s, in milliseconds."""
-    match = re.fullmatch(r"\s*([\d.eE+-]+)\s*(ms|s|)\s*", text)
-    try:
-        value = 0.0 if match is None else float(match[1]) * (1e3 if match[2] == "s" else 1.0)
-    except ValueError:
-        match, value = None, 0.0
-    if not 0 < value < float("inf"):
+    match = re.fullmatch(rf"\s*(\+?{_NUMBER})\s*(ms|s|)\s*", text)
+    value = 0.0 if match is None else float(match[1]) * (1e3 if match[2] == "s" else 1.0)
+    if match is None or not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text.strip()!r} is no time above 0, as 8ms or 0.008s")
-    if match is not None and not match[2]:
+    if not match[2]:
         raise argparse.ArgumentTypeError(f"{text.strip()!r} has no unit; give {match[1]}ms or {match[1]}s")
     return value
 

@@ -43,6 +43,10 @@ class Clash:
     open: tuple[str, ...]  # names of those that are not closed
     pair: tuple[int, int]  # indices
 
+    def severity(self) -> tuple:
+        """Return what sorts clashes: the deepest interference first, the widest clearance last."""
+        return CLASH_KINDS.index(self.kind), -(self.penetration or 0.0), self.distance, -self.faces, self.pair
+
 
 def assembly_size(scene: Scene) -> float:
     """Return the diagonal of the box around all objects [world units]."""
@@ -64,12 +68,10 @@ def find_clashes(scene: Scene, within: float = 0.0, tolerance: float | None = No
     interfere where faces intersect. Waits for the device.
 
     Args:
-        scene: `Scene`, of which solids hold what lies inside them.
         within: Distance [world units] up to which pairs that are apart are listed.
         tolerance: Depth and distance [world units] up to which a pair touches; None is 1e-6 of `assembly_size`.
 
-    Raises:
-        ValueError: within or tolerance is negative or not finite.
+    Raises ValueError for one that is negative or not finite.
     """
     size = assembly_size(scene)
     tolerance = TOUCH_TOLERANCE * size if tolerance is None else tolerance
@@ -97,12 +99,7 @@ def find_clashes(scene: Scene, within: float = 0.0, tolerance: float | None = No
         is_open = tuple(name for name, i in zip((first, second), pair) if not solid[i])
         depth_told = deep if decided else None
         clashes.append(Clash(first, second, kind, max(apart, 0.0), depth_told, count, is_open, tuple(pair)))
-    return sorted(clashes, key=_severity)
-
-
-def _severity(clash: Clash):
-    """Return what sorts clashes: the deepest interference first, the widest clearance last."""
-    return CLASH_KINDS.index(clash.kind), -(clash.penetration or 0.0), clash.distance, -clash.faces, clash.pair
+    return sorted(clashes, key=Clash.severity)
 
 
 def _sampled_depths(scene, met: Result, asked, size, tolerance) -> np.ndarray:
@@ -162,11 +159,9 @@ def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
     sub.add_file("assembly", metavar="ASSEMBLY", help="GLB, glTF, USD, 3MF, STEP, or OBJ with an `o` line a part")
     about = "list pairs no farther apart than this too [file's units] (0: what meets alone)"
-    sub.add_argument("--within", type=float, default=0.0, metavar="X", help=about)
-    about = (
-        f"depth and distance up to which parts touch [file's units] ({TOUCH_TOLERANCE:g} of the assembly's diagonal)"
-    )
-    sub.add_argument("--tolerance", type=float, metavar="X", help=about)
+    sub.add_number("--within", about, default=0.0)
+    about = "depth and distance up to which parts touch [file's units]"
+    sub.add_number("--tolerance", f"{about} ({TOUCH_TOLERANCE:g} of the assembly's diagonal)")
     sub.add_file("--csv", type=Path, metavar="FILE", help="write a row a pair")
     sub.add_file("--picture", type=Path, metavar="PNG", help="draw the assembly, what interferes coloured")
     sub.add_file("--glb", type=Path, metavar="FILE", help="write the assembly, faces that interfere in red")
@@ -191,7 +186,6 @@ def clash(options, progress) -> int:
     rows = [{key: value for key, value in asdict(each).items() if key != "pair"} for each in clashes]
     counts = {kind: sum(each.kind == kind for each in clashes) for kind in CLASH_KINDS}
     _write(options, scene, clashes, rows)
-    written = [str(path) for path in (options.csv, options.picture, options.glb) if path]
     summary = {
         "assembly": str(options.assembly),
         "device": str(scene.device),
@@ -200,12 +194,10 @@ def clash(options, progress) -> int:
         "tolerance": tolerance,
         "within": options.within,
         **counts,
-        "written": written,
+        "written": [str(path) for path in (options.csv, options.picture, options.glb) if path],
         "pairs": rows,
     }
-    print_result(
-        summary if options.json else {key: value for key, value in summary.items() if value != []}, options.json
-    )
+    print_result(summary, options.json)
     return int(counts[CLASH_KINDS[0]] > 0)
 
 

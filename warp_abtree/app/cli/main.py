@@ -1,8 +1,4 @@
-"""The command line: ``warp-abtree info|build|query|clash|run|sweep|view|picture|bench``.
-
-Exit status 0 when done, 2 with one line on stderr for bad input, 1 where work was lost, a device failed, or `clash`
-found interference, 130 and 143 when stopped by SIGINT and SIGTERM.
-"""
+"""The command line: ``warp-abtree info|build|query|clash|run|sweep|view|picture|bench``; see EXIT_STATUS."""
 
 import argparse
 import os
@@ -13,14 +9,7 @@ from pathlib import Path
 
 import warp as wp
 
-from warp_abtree.app.cli import (
-    bench_command,
-    clash_command,
-    model_commands,
-    query_command,
-    run_command,
-    sweep_command,
-)
+from warp_abtree.app.cli import bench_command, clash_command, model_commands, query_command, run_command, sweep_command
 from warp_abtree.app.cli.arguments import EXIT_STATUS, PROGRAM, Parser, PrintCompletion, shield_numbers
 from warp_abtree.app.cli.progress import Progress, compile_notice, start_warp
 from warp_abtree.app.pictures import command as picture_command
@@ -45,7 +34,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
 
-    def command(name, function, summary, examples, add_arguments=None):
+    def command(name, function, summary, examples, add_arguments):
         sub = commands.add_parser(
             name,
             help=summary,
@@ -55,9 +44,8 @@ def make_parser() -> argparse.ArgumentParser:
         )
         sub.set_defaults(function=function)
         sub.add_argument("--device", help='Warp device, "cpu" or "cuda:0"; by default the first GPU, else the CPU')
-        sub.add_argument("--json", action="store_true", help="print JSON")
-        if add_arguments is not None:
-            add_arguments(sub)
+        sub.add_flag("--json", "print JSON")
+        add_arguments(sub)
 
     models = model_commands
     command("info", models.info, models.INFO_SUMMARY, models.INFO_EXAMPLES, models.add_info_arguments)
@@ -69,9 +57,9 @@ def make_parser() -> argparse.ArgumentParser:
         ("view", view_command, view_command.run_viewer),
         ("picture", picture_command, picture_command.run_picture),
         ("sweep", sweep_command, sweep_command.run_sweep),
+        ("bench", bench_command, None),
     ):
         command(name, function, module.SUMMARY, module.EXAMPLES, module.add_arguments)
-    command("bench", None, bench_command.SUMMARY, bench_command.EXAMPLES, bench_command.add_arguments)
     return parser
 
 

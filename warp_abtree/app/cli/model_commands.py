@@ -27,11 +27,13 @@ def is_model(source) -> bool:
     return source.lower().endswith(".npz")
 
 
-def load_model(source, progress) -> Model:
-    """Open a built model, or build one of a mesh; say on stderr if it is of several parts."""
-    model = Model.open(source) if is_model(source) else Model.load(source, progress=progress)
-    tell_joined(source, model, progress)
-    return model
+def load_models(sources, progress) -> list[Model]:
+    """Open built models, or build them of meshes, each source once; say on stderr which are of several parts."""
+    known = {}
+    for source in dict.fromkeys(sources):
+        known[source] = Model.open(source) if is_model(source) else Model.load(source, progress=progress)
+        tell_joined(source, known[source], progress)
+    return [known[source] for source in sources]
 
 
 def tell_joined(source, mesh, progress):
@@ -65,7 +67,12 @@ def info(options, progress):
     """Print what a mesh file or a built model holds."""
     Scene(device=options.device)
     if is_model(options.mesh):
-        found = _describe_model(options.mesh)
+        model = Model.open(options.mesh)
+        forest = model.progressive
+        found = describe_mesh(mesh_from_arrays(forest.vertex_pos[: model.vertex_count], forest.face_vertex, model.name))
+        for key in ("parts", "file_vertices", "unreferenced_vertices", "welded_vertices"):
+            del found[key]  # a model does not keep them
+        found |= {"lods": model.lod_max + 1, "base_faces": forest.active_count(0)}
     else:
         mesh = load_mesh(options.mesh)
         tell_joined(options.mesh, mesh, progress)
@@ -73,25 +80,12 @@ def info(options, progress):
     print_result(found, options.json)
 
 
-def _describe_model(path) -> dict:
-    model = Model.open(path)
-    forest = model.progressive
-    found = describe_mesh(mesh_from_arrays(forest.vertex_pos[: model.vertex_count], forest.face_vertex, model.name))
-    for key in ("parts", "file_vertices", "unreferenced_vertices", "welded_vertices"):
-        del found[key]  # a model does not keep them
-    return found | {"lods": model.lod_max + 1, "base_faces": forest.active_count(0)}
-
-
 def add_build_arguments(sub: Parser):
     """Add the arguments of `build`."""
     sub.add_file("mesh", metavar="MESH", nargs="+", help=f"{MESHES}; one after another")
     sub.add_file("out", metavar="OUT", type=Path, help="file to write (.npz), or a folder for NAME.npz of each mesh")
-    sub.add_argument(
-        "--base-faces", type=positive_count, default=10, metavar="N", help="faces of the coarsest LOD (10)"
-    )
-    sub.add_argument(
-        "--orient", action="store_true", help="turn faces that disagree with neighbours or point into the solid"
-    )
+    sub.add_number("--base-faces", "faces of the coarsest LOD (10)", positive_count, 10)
+    sub.add_flag("--orient", "turn faces that disagree with neighbours or point into the solid")
 
 
 def build(options, progress):

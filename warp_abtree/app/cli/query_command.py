@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.app.cli.arguments import LOD_HELP, MESHES, PRECISION_NAMES, Parser
-from warp_abtree.app.cli.model_commands import diagonal_of, is_model, load_model, lod_at
+from warp_abtree.app.cli.model_commands import diagonal_of, is_model, load_models, lod_at
 from warp_abtree.app.cli.report import check_output, print_result, show_number
 from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.scene_file import load_scene
@@ -42,16 +42,12 @@ def add_arguments(sub: Parser):
     sub.add_argument("--output", choices=OUTPUTS, default="count", help="what to ask (count)")
     about = "signs of determinants: exact, or of the rounded ones (exact)"
     sub.add_argument("--precision", choices=PRECISION_NAMES, default="exact", help=about)
-    about = "width of the bracket that ends the search of a distance (0)"
-    sub.add_argument("--tolerance", type=float, metavar="X", help=about)
-    sub.add_argument("--relative", type=float, metavar="X", help="the same as a fraction of the distance (0)")
-    sub.add_argument("--beyond", type=float, metavar="X", help="distance that is far enough (none)")
-    about = "the distance of the original meshes, at whatever LODs A and B stand"
-    sub.add_argument("--originals", action="store_true", default=None, help=about)
-    about = "negative distances, as deep as the deepest point of one solid in the other"
-    sub.add_argument("--signed", action="store_true", default=None, help=about)
-    about = "what lies inside A or B, or objects of the scene, closed meshes, intersects it"
-    sub.add_argument("--solid", action="store_true", help=about)
+    sub.add_number("--tolerance", "width of the bracket that ends the search of a distance (0)")
+    sub.add_number("--relative", "the same as a fraction of the distance (0)")
+    sub.add_number("--beyond", "distance that is far enough (none)")
+    sub.add_flag("--originals", "the distance of the original meshes, at whatever LODs A and B stand", None)
+    sub.add_flag("--signed", "negative distances, as deep as the deepest point of one solid in the other", None)
+    sub.add_flag("--solid", "what lies inside A or B, or objects of the scene, closed meshes, intersects it")
     about = "write face pairs and contacts as .csv, of a scene its object pairs, or the whole result as .npz"
     sub.add_file("--record", type=Path, metavar="FILE", help=about)
 
@@ -153,8 +149,7 @@ def _list_options(options) -> dict:
 def _make_scene(options, progress):
     """Return a scene of both meshes, and their models."""
     scene = Scene(device=options.device)
-    models = [load_model(options.a, progress)]
-    models.append(models[0] if options.b == options.a else load_model(options.b, progress))
+    models = load_models([options.a, options.b], progress)
     progress.close()
     named = zip(("--lod-a", "--lod-b"), models, (options.lod_a, options.lod_b))
     lods = [lod_at(name, model, lod or "finest") for name, model, lod in named]
@@ -173,11 +168,7 @@ def _named(row, names=None) -> dict:
 
 
 def record_found(found, path: Path):
-    """Write the result of a query of one object pair; the file appears whole or not at all.
-
-    A .npz file holds the arrays of `Result` by their names. A .csv file has a row for each face pair, with its contact
-    if there is one; the summary over an object pair has no place there.
-    """
+    """Write the arrays of a `Result` to a .npz file, or a row for each face pair of one object pair to a .csv file."""
     if path.suffix.lower() == ".npz":
         names = (*RESULT_ARRAYS, "count")
         arrays = {name: getattr(found, name) for name in names if getattr(found, name) is not None}

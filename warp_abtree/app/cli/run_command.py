@@ -11,8 +11,7 @@ import numpy as np
 
 from warp_abtree.app.cli.arguments import PROGRAM, Parser, milliseconds, positive_count
 from warp_abtree.app.cli.report import check_output, print_result
-from warp_abtree.app.pictures.plots import draw_run
-from warp_abtree.app.pictures.render import import_pyvista
+from warp_abtree.app.pictures.render import draw_run, import_pyvista
 from warp_abtree.app.pictures.scenes import draw_scene
 from warp_abtree.app.toml.control import CONTROLLERS
 from warp_abtree.app.toml.folder import scene_names
@@ -34,11 +33,9 @@ def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
     about = f"scene file (.toml), file of several objects, or one of {', '.join(scene_names())}"
     sub.add_scene("scene", metavar="SCENE", help=about)
-    sub.add_argument("--frames", type=positive_count, metavar="N", help="frames to run (the scene's own number)")
+    sub.add_number("--frames", "frames to run (the scene's own number)", positive_count)
     sub.add_file("--picture", type=Path, metavar="PNG", help="draw the scene, intersecting faces coloured")
-    sub.add_argument(
-        "--objects", type=positive_count, metavar="N", help="about so many objects, by other counts or worlds"
-    )
+    sub.add_number("--objects", "about so many objects, by other counts or worlds", positive_count)
     sub.add_argument("--budget", type=milliseconds, metavar="TIME", help="time of a frame to hold, as 8ms or 0.008s")
     sub.add_argument("--controller", choices=CONTROLLERS, help="what chooses LODs (the scene's own, or predictive)")
     about = "write a row a frame as it ends, .csv or .json, or a page that plays the frames, .html"

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from warp_abtree.app.cli.arguments import PRECISION_NAMES, Parser, positive_count
-from warp_abtree.app.cli.model_commands import load_model, lod_at
+from warp_abtree.app.cli.model_commands import load_models, lod_at
 from warp_abtree.app.cli.query_command import OUTPUTS
 from warp_abtree.app.cli.report import print_result
 from warp_abtree.app.toml.scene_file import load_scene
@@ -24,13 +24,9 @@ EXAMPLES = (
 
 def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
-    sub.add_scene(
-        "source",
-        nargs="+",
-        metavar="SCENE_OR_MODELS",
-        help="two meshes or models and POSES.npy, (p, 7) or (p, 4, 4) poses of the second in the frame of the first; "
-        "or a scene of two objects and POSES.npy",
-    )
+    about = "two meshes or models and POSES.npy, (p, 7) or (p, 4, 4) poses of the second in the frame of the first; "
+    about += "or a scene of two objects and POSES.npy"
+    sub.add_scene("source", nargs="+", metavar="SCENE_OR_MODELS", help=about)
     sub.add_file("--out", "-o", type=Path, required=True, metavar="DIR", help="folder to make, or to go on in")
     sub.add_argument("--output", choices=(*OUTPUTS, "first_contact"), default="any", help="what to ask (any)")
     sub.add_argument("--precision", choices=PRECISION_NAMES, default="exact", help="as query (exact)")
@@ -38,21 +34,14 @@ def add_arguments(sub: Parser):
         sub.add_argument(f"--lod-{name}", metavar="LOD", help=f"LOD of {name.upper()}, as query (finest)")
     sub.add_file("--lods", type=Path, metavar="LODS.npy", help="LODs of both at each pose, (p, 2)")
     sub.add_file("--ends", type=Path, metavar="ENDS.npy", help="end poses of first_contact, as POSES.npy")
-    sub.add_argument("--solid", action="store_true", help="what lies inside A or B, closed meshes, intersects it")
-    about = "whether any or count are proved farther apart than X, too"
-    sub.add_argument("--within", type=float, metavar="X", help=about)
-    about = "what a distance, or a time of first contact, may be off by (0, 1e-6)"
-    sub.add_argument("--tolerance", type=float, metavar="X", help=about)
-    sub.add_argument("--beyond", type=float, metavar="X", help="distance that is far enough (none)")
-    sub.add_argument("--shard", type=positive_count, default=65536, metavar="N", help="poses a file (65536)")
-    sub.add_argument(
-        "--ray",
-        metavar="ADDRESS",
-        help='of a Ray cluster (Ray is started here). "none": this process, with --device cuda:0,cuda:1 on two',
-    )
-    sub.add_argument(
-        "--workers", type=positive_count, metavar="N", help="Ray workers (as many as GPUs, or else CPU cores)"
-    )
+    sub.add_flag("--solid", "what lies inside A or B, closed meshes, intersects it")
+    sub.add_number("--within", "whether any or count are proved farther apart than X, too")
+    sub.add_number("--tolerance", "what a distance, or a time of first contact, may be off by (0, 1e-6)")
+    sub.add_number("--beyond", "distance that is far enough (none)")
+    sub.add_number("--shard", "poses a file (65536)", positive_count, 65536)
+    about = 'of a Ray cluster (Ray is started here). "none": this process, with --device cuda:0,cuda:1 on two'
+    sub.add_argument("--ray", metavar="ADDRESS", help=about)
+    sub.add_number("--workers", "Ray workers (as many as GPUs, or else CPU cores)", positive_count)
 
 
 def run_sweep(options, progress):
@@ -69,13 +58,12 @@ def run_sweep(options, progress):
         raise ValueError("--device: Ray places workers on GPUs, or CPUs where there is none; it goes with --ray none")
     if not with_ray and options.workers:
         raise ValueError("--workers: they are Ray's")
-    named = {"progress": progress}
     if with_ray:
         # Ray tells of workers that end on stdout, which is for what this command prints.
         with contextlib.redirect_stdout(sys.stderr), RayPool(options.ray, options.workers) as pool:
-            done = run_shards(job, options.out, pool=pool, **named)
+            done = run_shards(job, options.out, pool, progress)
     else:
-        done = run_shards(job, options.out, pool=ThisProcess(options.device and options.device.split(",")), **named)
+        done = run_shards(job, options.out, ThisProcess(options.device and options.device.split(",")), progress)
     progress.close()
     seconds = time.perf_counter() - begin
     print_result({"out": str(options.out), "unit": "pose", **done, "seconds": seconds}, options.json)
@@ -87,8 +75,7 @@ def _make_job(options, progress) -> SweepJob:
         raise ValueError("POSES.npy is missing: two models are asked at poses")
     poses = source.pop()
     if len(source) == 2:
-        models = [load_model(source[0], progress)]
-        models.append(models[0] if source[1] == source[0] else load_model(source[1], progress))
+        models = load_models(source, progress)
         lods = [model.lod_max for model in models]
     elif len(source) == 1:
         if Path(source[0]).suffix.lower() not in ("", ".toml"):

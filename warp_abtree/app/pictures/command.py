@@ -4,9 +4,9 @@ from pathlib import Path
 
 from warp_abtree.app.cli.arguments import Parser, positive_count
 from warp_abtree.app.cli.report import check_output, print_result
-from warp_abtree.app.open_playback import add_playback_arguments, open_playback
 from warp_abtree.app.pictures.render import import_pyvista
 from warp_abtree.app.pictures.scenes import SIZE, SIZES, draw_frames, draw_snapshot
+from warp_abtree.app.playback import add_playback_arguments, open_playback
 from warp_abtree.app.render_data import Settings, Snapshot, objects_to_draw
 from warp_abtree.app.scene_view import make_view
 from warp_abtree.checks.arguments import whole_number
@@ -33,8 +33,7 @@ def add_arguments(sub: Parser):
     sub.add_argument("--every", type=positive_count, default=1, metavar="K", help="of these, draw each K-th (1)")
     for name, what in (("eye", "direction to the eye"), ("up", "direction upwards")):
         sub.add_argument(f"--{name}", nargs=3, type=float, metavar=("X", "Y", "Z"), help=f"{what} (the scene's own)")
-    about = "draw distances between objects: of few all, of more those whose boxes overlap"
-    sub.add_argument("--distances", action="store_true", help=about)
+    sub.add_flag("--distances", "draw distances between objects: of few all, of more those whose boxes overlap")
     sub.add_argument("--world", type=int, metavar="W", help="world to draw (the scene's own)")
     sub.add_argument("--size", type=positive_count, default=SIZE, metavar="PX", help=f"pixels along a side ({SIZE})")
 

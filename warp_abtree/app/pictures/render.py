@@ -11,8 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_abtree.app.styles import STAGE_LABELS
 from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.lod.view import Camera
+from warp_abtree.simulate.frame_row import FrameRow
 
 BACKGROUND = (1.0, 1.0, 1.0)
 VIEW_ANGLE = 25.0  # degrees
@@ -95,25 +97,44 @@ def render(panel: Panel, camera: Camera, size: int) -> np.ndarray:
         plotter.close()
 
 
-def camera_of(panels: list[Panel], eye, up) -> Camera:
-    """Return a camera that sees all that panels show; eye and up are directions in the world."""
+def render_panels(panels: list[Panel], eye, up, size: int) -> list:
+    """Return images of panels, seen from the direction `eye` by one camera, less the empty margin that all share."""
     drawn = [part for panel in panels for part in (panel.triangles, *(ends for ends, _ in panel.lines))]
-    return camera_around(np.concatenate([np.reshape(part, (-1, 3)) for part in drawn]), eye, up)
+    camera = camera_around(np.concatenate([np.reshape(part, (-1, 3)) for part in drawn]), eye, up)
+    images = [render(panel, camera, size) for panel in panels]
+    filled = np.any([(image < 250).any(axis=2) for image in images], axis=0)
+    if not filled.any():
+        return images
+    rows, columns = np.flatnonzero(filled.any(axis=1)), np.flatnonzero(filled.any(axis=0))
+    y, x = max(rows[0] - 8, 0), max(columns[0] - 8, 0)
+    return [image[y : rows[-1] + 9, x : columns[-1] + 9] for image in images]
 
 
 def draw(panels: list[Panel], path, title: str, legend, eye, up, size: int = 620):
     """Write panels side by side, seen from `eye` by one camera, above a legend of (colour, label), to a PNG file."""
-    import_pyvista("a picture")
-    camera = camera_of(panels, eye, up)
-    images = crop([render(panel, camera, size) for panel in panels])
+    images = render_panels(panels, eye, up, size)
     write_png(lay_out(images, [panel.title for panel in panels], title, legend), path)
+
+
+def new_figure(size, **options):
+    """Return an empty figure of Matplotlib of a size [inches]."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=100, facecolor=BACKGROUND, **options)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def figure_image(figure) -> np.ndarray:
+    """Return a figure as an image, uint8 (rows, columns, 3)."""
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[:, :, :3].copy()
 
 
 def lay_out(images: list, titles: list[str], title: str, legend) -> np.ndarray:
     """Return images of one size side by side, with titles and a legend, uint8 (rows, columns, 3)."""
     import matplotlib.patches
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
     rows, columns = images[0].shape[:2]
     gap, head, panel_head = 16, 44 if title else 0, 50
@@ -123,9 +144,7 @@ def lay_out(images: list, titles: list[str], title: str, legend) -> np.ndarray:
     across = max(1, min(len(legend) // 2, width // (2 * entry)))
     foot = 40 + 20 * (-(-len(legend) // (2 * across)) - 1)
     height = head + panel_head + rows + foot
-    dpi = 100
-    figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor=BACKGROUND)
-    canvas = FigureCanvasAgg(figure)
+    figure = new_figure((width / 100, height / 100))
     middle: dict = {"ha": "center", "va": "center"}
     figure.text(0.5, 1 - 0.5 * head / height, title, **middle, fontsize=15, fontweight="bold", color="0.15")
     for i, (text, image) in enumerate(zip(titles, images)):
@@ -139,11 +158,9 @@ def lay_out(images: list, titles: list[str], title: str, legend) -> np.ndarray:
     lines = [legend[i : i + 2 * across] for i in range(0, len(legend), 2 * across)]
     entries = [line[i] for i in range(2 * across) for line in lines if i < len(line)]
     handles = [matplotlib.patches.Patch(facecolor=colour, edgecolor="0.4", label=label) for colour, label in entries]
-    figure.legend(
-        handles=handles, loc="lower center", ncols=2 * across, frameon=False, fontsize=10.5, borderaxespad=0.6
-    )
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+    look = {"frameon": False, "fontsize": 10.5, "borderaxespad": 0.6}
+    figure.legend(handles=handles, loc="lower center", ncols=2 * across, **look)
+    return figure_image(figure)
 
 
 def write_png(image: np.ndarray, path):
@@ -164,16 +181,39 @@ def write_animation(images: list, path, milliseconds: int):
     kind = Path(path).suffix[1:].lower()
     options: dict = {"quality": 70, "method": 6} if kind == "webp" else {"optimize": True}
     with atomic_write(path) as file:
-        first.save(
-            file, format=kind.upper(), save_all=True, append_images=others, duration=milliseconds, loop=0, **options
-        )
+        first.save(file, kind.upper(), save_all=True, append_images=others, duration=milliseconds, loop=0, **options)
 
 
-def crop(images: list) -> list:
-    """Cut the empty margin that all images share, and leave a little."""
-    drawn = np.any([(image < 250).any(axis=2) for image in images], axis=0)
-    if not drawn.any():
-        return images
-    rows, columns = np.flatnonzero(drawn.any(axis=1)), np.flatnonzero(drawn.any(axis=0))
-    y, x = max(rows[0] - 8, 0), max(columns[0] - 8, 0)
-    return [image[y : rows[-1] + 9, x : columns[-1] + 9] for image in images]
+def draw_run(rows: list[FrameRow], fractions, path, title: str):
+    """Draw LODs (fractions of the finest, (frames, n)), times by stage and certified error of a run to a PNG file."""
+    figure = new_figure((10, 10), layout="constrained")
+    figure.suptitle(title, fontsize=14, fontweight="bold", color="0.15")
+    lods, times, errors = figure.subplots(3, 1, sharex=True)
+    frames = np.array([row.frame for row in rows])
+
+    low, tenth, middle, ninth, high = np.percentile(fractions, (0, 10, 50, 90, 100), axis=1)
+    lods.fill_between(frames, low, high, color="C0", alpha=0.15, linewidth=0, label="all objects")
+    lods.fill_between(frames, tenth, ninth, color="C0", alpha=0.35, linewidth=0, label="10 to 90 % of them")
+    lods.plot(frames, middle, color="C0", label="median")
+    lods.set(ylabel="LOD, relative to the finest", ylim=(-0.03 * high.max() - 1e-6, 1.05 * high.max() + 1e-6))
+
+    stages = [[getattr(row, name) for row in rows] for name in STAGE_LABELS]
+    cost = np.sum(stages[:4], axis=0)
+    times.stackplot(frames, *stages, labels=STAGE_LABELS.values(), alpha=0.8, linewidth=0, step="mid")
+    times.step(frames, cost, where="mid", color="black", linewidth=0.8, label="T': select to query")
+    budgets = [row.budget_ms for row in rows if row.budget_ms is not None]
+    if budgets:
+        times.axhline(budgets[-1], color="red", linewidth=1, label=f"T = {budgets[-1]:g} ms")
+        times.axhline(1.1 * budgets[-1], color="red", linewidth=1, linestyle=":", label="T + 10 %")
+    # A single slow frame must not compress the rest.
+    top = np.percentile(np.sum(stages, axis=0), 99)
+    times.set(ylabel="time [ms]", ylim=(0, 1.25 * max(top, *budgets, 1e-6)))
+
+    errors.plot(frames, [row.error_mean for row in rows], color="C3", label="mean of the objects")
+    errors.plot(frames, [row.error_max for row in rows], color="C3", linestyle=":", label="greatest")
+    errors.set(ylabel="certified error [world units]", xlabel="frame", xlim=(frames[0], max(frames[-1], 1)))
+    errors.set_ylim(bottom=0)
+    for axes in (lods, times, errors):
+        axes.grid(True, alpha=0.3)
+        axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    write_png(figure_image(figure), path)

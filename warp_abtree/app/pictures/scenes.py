@@ -7,7 +7,7 @@ import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.cli.report import check_output
-from warp_abtree.app.pictures.render import Panel, camera_of, crop, draw, lay_out, render, write_animation
+from warp_abtree.app.pictures.render import Panel, draw, lay_out, render_panels, write_animation
 from warp_abtree.app.render_data import (
     LABELS,
     RenderData,
@@ -95,8 +95,7 @@ def draw_frames(scene: Scene, snapshots, shown, path, title: str, view, settings
         panels.append(make_panel(cache, data))
         seen.append(replace(data, colours=data.colours[:0], poses=data.poses[:0]))
         times.append(snapshot.time)
-    camera, legend = camera_of(panels, view.eye, view.up), make_legend(scene, seen)
-    images = crop([render(panel, camera, size) for panel in panels])
+    images, legend = render_panels(panels, view.eye, view.up, size), make_legend(scene, seen)
     drawn = [lay_out([image], [panel.title], title, legend) for image, panel in zip(images, panels)]
     write_animation(drawn, path, round(1000 * (times[-1] - times[0]) / (len(times) - 1)))
 
@@ -127,13 +126,8 @@ def panel_lods(loaded) -> list[np.ndarray]:
 def draw_scene(loaded, path, time: float, poses=None, lods=None):
     """Draw a scene file's picture at one time and several LODs: both sides of an LOD switch, the same poses.
 
-    The scene's LODs are what they were afterwards, its poses those of the picture.
-
-    Args:
-        loaded: What `load_scene` returned.
-        time: Time of the poses [s], unless the file's `[picture]` has one.
-        poses: Pose of every object, (n, 7), in the place of those of the time.
-        lods: LOD of every object, (n,), for one panel in the place of the file's.
+    The scene's LODs are what they were afterwards, its poses those of the picture: of a time [s], unless the file's
+    `[picture]` has one, or those given, (n, 7). LODs (n,) are for one panel in the place of the file's.
     """
     scene, view = loaded.scene, loaded.picture
     time = time if view.time is None else view.time

@@ -33,7 +33,11 @@ def make_group(path, key: str, table, dynamics, rng, room: int) -> ObjectGroup:
 
     Raises SceneError for more copies than there is room for, or keys of rigid bodies where there are none.
     """
-    _check_dynamics(path, key, table, dynamics)
+    if dynamics is None:
+        if table.kinematic:
+            fail(path, f"{key}.kinematic", "the scene has no [dynamics]")
+    elif not table.static and not table.kinematic and table.shuttle is not None:
+        fail(path, f"{key}.shuttle", "a rigid body goes its own way; kinematic = true lets it shuttle")
     layer = 1 if table.grid is None else math.prod(n for n in table.grid.size if n)
     if max(table.count or 1, layer) * table.worlds > room:
         cause = "worlds" if table.worlds > 1 else "grid.size" if layer > 1 else "count" if table.count else "model"
@@ -47,7 +51,8 @@ def make_group(path, key: str, table, dynamics, rng, room: int) -> ObjectGroup:
         "axis": np.tile([0.0, 0.0, 1.0], (count, 1)),
         "shuttle": np.zeros((count, 3)),
         "period": np.full(count, np.inf),
-        **{name: np.zeros(count) for name in ("rate", "phase")},
+        "rate": np.zeros(count),
+        "phase": np.zeros(count),
     }
     if table.turn is not None:
         motion["axis"][:], motion["rate"][:] = unit(table.turn.axis), math.radians(table.turn.degrees)
@@ -57,15 +62,6 @@ def make_group(path, key: str, table, dynamics, rng, room: int) -> ObjectGroup:
     _scatter(table.random, motion, rng)
     world = np.repeat(np.arange(table.world, table.world + table.worlds), len(offsets))
     return ObjectGroup(key, table, world, motion, np.full(count, table.kinematic))
-
-
-def _check_dynamics(path, key, table, dynamics):
-    """Refuse keys that rigid bodies alone have, or that they cannot have."""
-    if dynamics is None:
-        if table.kinematic:
-            fail(path, f"{key}.kinematic", "the scene has no [dynamics]")
-    elif not table.static and not table.kinematic and table.shuttle is not None:
-        fail(path, f"{key}.shuttle", "a rigid body goes its own way; kinematic = true lets it shuttle")
 
 
 def _quaternion(rotation) -> np.ndarray:

@@ -145,26 +145,15 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
         motion = Kinematic(**{key: np.concatenate([group.motion[key] for group in groups]) for key in groups[0].motion})
     except ValueError as error:  # a sum of finite numbers that is not
         fail(path, "objects", error)
-    _check_memory(path, tables, len(motion.position))
+    check_faces(path, tables.models)
+    count, window = len(motion.position), 1 if tables.lod is None else tables.lod.window or 1
+    if window * count > MOTION_LIMIT:
+        fail(path, "lod.window", f"{window:,} frames of {count:,} objects are more than {MOTION_LIMIT:,} together")
     models = {name: build_model(path, name, table, progress) for name, table in tables.models.items()}
     owners = _add_objects(path, scene, groups, models)
-    loaded = SceneFile(
-        path=path,
-        title=path.stem if tables.scene.title is None else tables.scene.title,
-        frames=tables.scene.frames,
-        time_step=tables.scene.time_step,
-        models=models,
-        scene=scene,
-        motion=motion,
-        worlds=np.concatenate([group.world for group in groups]),
-        base_lods=scene.lods.astype(np.int64),
-        sweeps=[_make_sweep(table, models, owners) for table in tables.lod_sweep],
-        picture=tables.picture,
-        camera=tables.camera,
-        control=control,
-        dynamics=tables.dynamics,
-        kinematic=np.concatenate([group.kinematic for group in groups]),
-    )
+    sweeps = [_make_sweep(table, models, owners) for table in tables.lod_sweep]
+    worlds, kinematic = (np.concatenate([getattr(g, name) for g in groups]) for name in ("world", "kinematic"))
+    loaded = _loaded(path, tables, scene, models, motion, worlds, kinematic, control, sweeps)
     scene.set_lods(loaded.lods_at(0.0))
     scene.set_poses(motion.poses(0.0))
     return loaded
@@ -175,22 +164,28 @@ def load_assembly(path: Path, device=None, progress=None) -> SceneFile:
     tables = read_tables(path, "models = {}")  # all that a file may leave out
     scene = scene_from_file(path, device, progress=progress)
     poses = scene.poses
+    models = {scene.name(scene.object_model.index(k)): model for k, model in enumerate(scene.models)}
+    motion, still = Kinematic(poses[:, :3], poses[:, 3:]), np.zeros(scene.object_count, bool)
+    return _loaded(path, tables, scene, models, motion, scene.worlds, still, make_control(path, None), [])
+
+
+def _loaded(path, tables, scene, models, motion, worlds, kinematic, control, sweeps) -> SceneFile:
     return SceneFile(
         path=path,
-        title=path.stem,
+        title=path.stem if tables.scene.title is None else tables.scene.title,
         frames=tables.scene.frames,
         time_step=tables.scene.time_step,
-        models={scene.name(scene.object_model.index(k)): model for k, model in enumerate(scene.models)},
+        models=models,
         scene=scene,
-        motion=Kinematic(poses[:, :3], poses[:, 3:]),
-        worlds=scene.worlds,
+        motion=motion,
+        worlds=worlds,
         base_lods=scene.lods.astype(np.int64),
-        sweeps=[],
+        sweeps=sweeps,
         picture=tables.picture,
-        camera=None,
-        control=make_control(path, None),
-        dynamics=None,
-        kinematic=np.zeros(scene.object_count, bool),
+        camera=tables.camera,
+        control=control,
+        dynamics=tables.dynamics,
+        kinematic=kinematic,
     )
 
 
@@ -214,14 +209,6 @@ def _check_names(path, tables):
                 fail(path, f"lod_sweep[{i}].objects", f"no object is named {name!r}")
     if tables.lod_sweep and tables.lod is not None:
         fail(path, "lod", "LODs are swept, or chosen by a controller, not both")
-
-
-def _check_memory(path, tables, count):
-    """Refuse what would exhaust the memory although each number is within its own limits."""
-    check_faces(path, tables.models)
-    window = 1 if tables.lod is None else tables.lod.window or 1
-    if window * count > MOTION_LIMIT:
-        fail(path, "lod.window", f"{window:,} frames of {count:,} objects are more than {MOTION_LIMIT:,} together")
 
 
 def _add_objects(path, scene, groups, models):

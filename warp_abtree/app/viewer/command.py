@@ -8,8 +8,7 @@ import logging
 import socket
 
 from warp_abtree.app.cli.arguments import Parser, milliseconds
-from warp_abtree.app.open_playback import add_playback_arguments, open_playback
-from warp_abtree.app.playback import Playback, StillPlayback
+from warp_abtree.app.playback import Playback, StillPlayback, add_playback_arguments, open_playback
 from warp_abtree.app.viewer.guard import refuse_foreign
 from warp_abtree.scene.scene import Scene
 

@@ -13,12 +13,7 @@ NONE = "none"
 
 
 class ObjectPanel:
-    """Folder of the objects, made in a viser panel.
-
-    Attributes:
-        visible: Whether each object is shown, bool (n,).
-        selected: Index of the selected object, or None.
-    """
+    """Folder of the objects, made in a viser panel: which are `visible`, bool (n,), and which one is `selected`."""
 
     def __init__(self, gui, scene, objects, on_change):
         """Build the folder of `objects` of a scene; `on_change(handle, act)` acts on a value that the user set."""

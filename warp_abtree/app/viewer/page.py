@@ -40,12 +40,7 @@ BUDGET_MODES = ("predictive", "paper")
 class Page:
     """A page about a playback, on a viser server, which the page does not stop.
 
-    Attributes:
-        settings: `Settings` of the panel.
-        objects: `ObjectPanel`: which objects are visible, and which one is selected.
-        playing: Whether frames follow one another.
-        snapshot: `Snapshot` that is shown.
-        snapshots: How many were sent so far.
+    `playing` is whether frames follow one another; `snapshot` is shown, the last of the `snapshots` sent so far.
     """
 
     def __init__(self, server, playback):
@@ -205,24 +200,20 @@ class Page:
         """Serve until `close`, or for a time [s]."""
         end = math.inf if seconds is None else time.monotonic() + seconds
         while not self._closed and time.monotonic() < end:
-            if not (self.playing or self._steps or self._dirty):
-                try:
-                    self._act(self._events.get(timeout=0.1))
-                except queue.Empty:
+            is_idle = not (self.playing or self._steps or self._dirty)
+            try:
+                while True:
+                    self._act(self._events.get(is_idle, 0.1))
+                    is_idle = False
+            except queue.Empty:
+                if is_idle:
                     if self.viewer_scene.waits:  # the browser was not ready for all of the last snapshot
                         self._send()
                     continue
-            while True:
-                try:
-                    self._act(self._events.get_nowait())
-                except queue.Empty:
-                    break
             if self._closed:
                 return
             self.advance()
-            wait = self._snapshot_time + FRAME_SECONDS - time.monotonic()
-            if wait > 0:
-                time.sleep(wait)
+            time.sleep(max(0.0, self._snapshot_time + FRAME_SECONDS - time.monotonic()))
             self._snapshot_time = time.monotonic()
 
     def close(self):

@@ -6,14 +6,7 @@ from html import escape
 import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
-from warp_abtree.app.render_data import (
-    Settings,
-    Snapshot,
-    compose,
-    legend_html,
-    make_legend,
-    objects_to_draw,
-)
+from warp_abtree.app.render_data import Settings, Snapshot, compose, legend_html, make_legend, objects_to_draw
 from warp_abtree.app.toml.objects import unit
 from warp_abtree.app.viewer.viewer_scene import ViewerScene, light_scene, place_camera
 from warp_abtree.checks.atomic_write import atomic_write
@@ -50,15 +43,10 @@ class _RoundedMeshes(geometry.MeshCache):
 
 
 class SceneRecording:
-    """A recording on a viser server that shows nothing else.
+    """A recording of a `SceneFile`, at its start, on a viser server that shows nothing else.
 
-    LODs are colours where a controller chooses them, else intersecting faces are coloured; contact points are drawn
-    where there are rigid bodies. Of many frames every k-th is kept.
-
-    Args:
-        loaded: `SceneFile`, at its start.
-        frames: Frames that will be run.
-        by_lod: Whether colours tell LODs.
+    Colours tell LODs, or else intersecting faces; contact points are drawn where there are rigid bodies. Of many frames
+    that will be run every k-th is kept.
     """
 
     def __init__(self, server, loaded, frames: int, by_lod: bool):
@@ -79,9 +67,8 @@ class SceneRecording:
         if row.frame % self.stride:
             return
         scene = self.loaded.scene
-        snapshot = Snapshot(
-            row.frame, row.time, scene.poses, scene.lods, scene.intersect(output=self.settings.output), row
-        )
+        result = scene.intersect(output=self.settings.output)
+        snapshot = Snapshot(row.frame, row.time, scene.poses, scene.lods, result, row)
         data = compose(self.cache, snapshot, self.shown, self.settings)
         contacts = None if data.contacts is None else short_floats(data.contacts)
         triangles = {model: short_floats(corners) for model, corners in data.intersecting.items()}

@@ -13,6 +13,7 @@ from warp_abtree.app.styles import BOX_COLOUR, COLOURS, CONTACT_COLOUR, NEAREST_
 SINGLE_LIMIT = 24  # objects up to which each has its own mesh; with more, those of a model and LOD are instances of one
 READY_SECONDS = 0.25  # that a browser takes to draw instances of a new mesh
 LINE = {"thickness": 2.5, "thickness_units": "screen"}
+POINT = {"colors": to_bytes(CONTACT_COLOUR), "point_shape": "circle", "point_shading": "flat", "precision": "float32"}
 POINT_SIZE = 1 / 60  # of contact points, of the diagonal of the smallest model
 CAMERA_DISTANCE = 1.8  # of the first camera, in radii of what is shown
 LIGHT = 0.6
@@ -59,32 +60,41 @@ class ViewerScene:
         self._show_single(data, data.shown if few else data.shown[:0])
         self._show_instances(data, data.shown[:0] if few else data.shown)
         for owner in range(len(self.cache.scene.models)):
-            corners = data.intersecting.get(owner, ())
-            self._show_triangles(f"/intersecting/{owner}", corners, COLOURS[owner % len(COLOURS)][1])
-        self._show_segments("/distances", data.nearest, NEAREST_COLOUR)
-        self._show_segments("/boxes", data.boxes, BOX_COLOUR)
-        self._show_points("/contacts", () if data.contacts is None else data.contacts)
+            vertices = np.reshape(data.intersecting.get(owner, ()), (-1, 3))
+            arrays = {"vertices": vertices, "faces": np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)}
+            look = {"color": to_bytes(COLOURS[owner % len(COLOURS)][1]), **PLAIN}
+            self._show_layer(f"/intersecting/{owner}", self.api.add_mesh_simple, arrays, look)
+        for name, ends, colour in (("/distances", data.nearest, NEAREST_COLOUR), ("/boxes", data.boxes, BOX_COLOUR)):
+            if name in self._layers and len(ends) not in (0, len(self._layers[name].sent["points"])):
+                self._layers.pop(name).handle.remove()  # points and colours go together
+            colours = np.tile(np.array(to_bytes(colour), np.uint8), (len(ends), 2, 1))
+            arrays = {"points": ends.astype(np.float32), "colors": colours}
+            self._show_layer(name, self.api.add_line_segments, arrays, LINE)
+        points = np.reshape(() if data.contacts is None else data.contacts, (-1, 3)).astype(np.float32)
+        look = {**POINT, "point_size": POINT_SIZE * min(self.cache.diagonals)}
+        self._show_layer("/contacts", self.api.add_point_cloud, {"points": points}, look)
         self._show_labels(data)
 
-    def _update(self, node: _Node, **arrays):
-        """Assign the arrays that differ from those sent last."""
-        for name, array in arrays.items():
-            before = node.sent.get(name)
-            if before is None or before.shape != array.shape or not np.array_equal(before, array):
-                setattr(node.handle, name, array)
-                node.sent[name] = array
-                self.sent += array.nbytes
+    def _show_layer(self, name, add, arrays, look):
+        """Show arrays as a node of their own, which `add` makes; where the first is empty, hide it."""
+        node, some = self._layers.get(name), len(next(iter(arrays.values()))) > 0
+        if node is None and some:
+            self._layers[name] = self._added(add(name, **arrays, **look), **arrays)
+        elif node is not None:
+            self._update(node, **(arrays if some else {}), visible=some)
 
-    def _set(self, node: _Node, name: str, value):
-        """Assign a value if another was sent last."""
-        if node.sent[name] != value:
-            setattr(node.handle, name, value)
-            node.sent[name] = value
+    def _update(self, node: _Node, **values):
+        """Assign the values that differ from those sent last."""
+        for name, value in values.items():
+            if not np.array_equal(node.sent[name], value):
+                setattr(node.handle, name, value)
+                node.sent[name] = value
+                self.sent += getattr(value, "nbytes", 0)
 
-    def _added(self, handle, arrays, visible=True, **values) -> _Node:
-        """Keep what was just added, with arrays and other values."""
-        self.sent += sum(array.nbytes for array in arrays.values())
-        return _Node(handle, {**arrays, "visible": visible, **values}, self.clock())
+    def _added(self, handle, visible=True, **sent) -> _Node:
+        """Keep what was just added, with the values that were sent."""
+        self.sent += sum(getattr(value, "nbytes", 0) for value in sent.values())
+        return _Node(handle, {**sent, "visible": visible}, self.clock())
 
     def _mesh_arrays(self, key):
         vertices, faces, _ = self.cache.mesh(*geometry.split_key(key))
@@ -94,25 +104,21 @@ class ViewerScene:
 
     def _show_single(self, data, objects):
         for i in set(self._single) - set(objects.tolist()):
-            self._set(self._single[i], "visible", False)
+            self._update(self._single[i], visible=False)
         for i in objects.tolist():
             pose, key = data.poses[i], int(data.keys[i])
             look = {"color": tuple(data.colours[i].tolist()), **_material(data)}
             place = {"position": pose[:3].copy(), "wxyz": pose[[6, 3, 4, 5]]}
             node = self._single.get(i)
             if node is None:
-                arrays = {**self._mesh_arrays(key), **place}
-                handle = self.api.add_mesh_simple(f"/objects/{i}", **arrays, **look, **PLAIN)
+                sent = {**self._mesh_arrays(key), **place, **look}
+                handle = self.api.add_mesh_simple(f"/objects/{i}", **sent, **PLAIN)
                 handle.on_click(lambda _, i=i: self.pick(i))
-                self._single[i] = self._added(handle, arrays, key=key, **look)
+                self._single[i] = self._added(handle, key=key, **sent)
                 continue
-            if node.sent["key"] != key:
-                self._update(node, **self._mesh_arrays(key))
-                node.sent["key"] = key
-            for name, value in look.items():
-                self._set(node, name, value)
-            self._update(node, **place)
-            self._set(node, "visible", True)
+            mesh = {} if node.sent["key"] == key else self._mesh_arrays(key)
+            node.sent["key"] = key
+            self._update(node, **mesh, **look, **place, visible=True)
 
     # Instances.
 
@@ -122,7 +128,7 @@ class ViewerScene:
         coming = geometry.group_objects(self._next, objects[self._next[objects] >= 0])
         for key, before in self._meshes.items():
             if key not in groups:
-                self._set(before, "visible", False)
+                self._update(before, visible=False)
         for key, members in (*groups.items(), *coming.items()):
             poses = data.poses[members].astype(np.float32)
             arrays = {
@@ -132,12 +138,9 @@ class ViewerScene:
             }
             node = self._meshes.pop(key, None)
             if node is None:
-                node = self._add_instances(key, arrays, visible=key in groups, **_material(data))
+                node = self._add_instances(key, {**arrays, "visible": key in groups, **_material(data)})
             elif key in groups:
-                for name, value in _material(data).items():
-                    self._set(node, name, value)
-                self._update(node, **arrays)
-                self._set(node, "visible", True)
+                self._update(node, **_material(data), **arrays, visible=True)
             node.members = members
             self._meshes[key] = node  # the last used stand last
         hidden = [key for key in self._meshes if key not in groups and key not in coming]
@@ -165,68 +168,25 @@ class ViewerScene:
         self._next[asks] = wanted[asks]
         self.waits = bool(late.any())
 
-    def _add_instances(self, key, arrays, **look) -> _Node:
-        arrays = {**self._mesh_arrays(key), **arrays}
+    def _add_instances(self, key, look) -> _Node:
+        sent = {**self._mesh_arrays(key), **look}
         name = "/meshes/{}/{}".format(*geometry.split_key(key))
-        handle = self.api.add_batched_meshes_simple(name, **arrays, lod="off", **look, **PLAIN)
-        node = self._added(handle, arrays, **look)
+        handle = self.api.add_batched_meshes_simple(name, **sent, lod="off", **PLAIN)
+        node = self._added(handle, **sent)
         handle.on_click(lambda event: self.pick(int(node.members[event.instance_index])))
         return node
-
-    def _show_triangles(self, name, corners, colour):
-        """Show triangles as a node of their own; without any hide it."""
-        node, arrays = self._layers.get(name), {}
-        if len(corners):
-            vertices = corners.reshape(-1, 3)
-            arrays = {"vertices": vertices, "faces": np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)}
-        if node is None and arrays:
-            handle = self.api.add_mesh_simple(name, **arrays, color=to_bytes(colour), **PLAIN)
-            self._layers[name] = self._added(handle, arrays)
-        elif node is not None:
-            self._update(node, **arrays)
-            self._set(node, "visible", bool(arrays))
-
-    def _show_points(self, name, points):
-        """Show points (k, 3) as a node of their own; without any hide it."""
-        node, arrays = self._layers.get(name), {"points": np.asarray(points, np.float32)} if len(points) else {}
-        if node is None and arrays:
-            look = {"colors": to_bytes(CONTACT_COLOUR), "point_size": POINT_SIZE * min(self.cache.diagonals)}
-            shape = {"point_shape": "circle", "point_shading": "flat", "precision": "float32"}
-            self._layers[name] = self._added(self.api.add_point_cloud(name, **arrays, **look, **shape), arrays)
-        elif node is not None:
-            self._update(node, **arrays)
-            self._set(node, "visible", bool(arrays))
-
-    def _show_segments(self, name, ends, colour):
-        """Show segments (k, 2, 3) as a node of their own; without any hide it."""
-        node, count = self._layers.get(name), len(ends)
-        if node is not None and count and count != len(node.sent["points"]):
-            node.handle.remove()  # points and colours go together
-            node = None
-        if node is None and count:
-            colour = np.array(to_bytes(colour), np.uint8)
-            arrays = {"points": ends.astype(np.float32), "colors": np.tile(colour, (count, 2, 1))}
-            handle = self.api.add_line_segments(name, **arrays, **LINE)
-            self._layers[name] = self._added(handle, arrays)
-        elif node is not None:
-            self._update(node, **({"points": ends.astype(np.float32)} if count else {}))
-            self._set(node, "visible", count > 0)
 
     def _show_labels(self, data):
         """Show the least distances in numbers at the middles of their segments."""
         told = data.labels()
         for k, (point, text) in enumerate(told):
-            place = {"position": point}
             if k == len(self._labels):
-                handle = self.api.add_label(f"/distance/{k}", text=text, anchor="center-center", **place)
-                self._labels.append(self._added(handle, place, text=text))
-                continue
-            node = self._labels[k]
-            self._set(node, "text", text)
-            self._update(node, **place)
-            self._set(node, "visible", True)
+                handle = self.api.add_label(f"/distance/{k}", text=text, position=point, anchor="center-center")
+                self._labels.append(self._added(handle, text=text, position=point))
+            else:
+                self._update(self._labels[k], text=text, position=point, visible=True)
         for node in self._labels[len(told) :]:
-            self._set(node, "visible", False)
+            self._update(node, visible=False)
 
 
 def _material(data) -> dict:

@@ -1,64 +1,22 @@
 """`RobotQuery`: a chunk of configurations as an operator; and edges, halved until each stretch is decided."""
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import whole_number
-from warp_abtree.checks.device_memory import DeviceMemory
-from warp_abtree.checks.upload import struct_of
-from warp_abtree.interop.robot.link_query import LinkDistances, LinkHits, LinkPairs, LinkRequest
-from warp_abtree.interop.robot.surroundings import RobotBatch
-from warp_abtree.kernels.robot.link_pairs import Parts
+from warp_abtree.interop.robot.link_query import LinkQuery
 from warp_abtree.query.request import CapacityError
 from warp_abtree.scene.sweep import CONTACT_ROWS
-from warp_abtree.state.batch import check_pairs
 
 NEAREST_ROWS = np.dtype(
     [("distance", np.float64), ("points", np.float64, (2, 3)), ("faces", np.int32, 2), ("pair", np.int32, 2)]
 )
-PAIRS_GUESS = 2  # of a configuration and stage
 # Edges whose stretches are halved at a time.
 EDGES_AT_ONCE = 1024
 # Stretches of an edge that are looked at at a time, and how short they may be: what takes more is undecided.
 STRETCHES_MAX, WIDTH_LEAST = 1024, 2.0**-30
 
 
-def make_link_request(robot, robots: RobotBatch, room: int) -> LinkRequest:
-    """Return the `LinkRequest` of a chunk, with parts asked from the outermost inwards."""
-    description, device = robot.description, robot.device
-    frame = [description.links[robot.link_names[k]] for k in robot.model_link]
-    paths = [description.path(f) for f in frame]
-    order = sorted(range(len(frame)), key=lambda k: -len(paths[k]))
-    entries, stages, pairs = [], [], check_pairs(robot.pairs, len(frame))
-    mounted = {whole_number(k, "mounted", 0, len(robot.link_names) - 1) for k in robot.mounted}
-    for k in order:
-        first = len(entries)
-        if robots.count and robot.model_link[k] not in mounted:
-            entries.append((k, -1, -1))
-        for i, j in pairs[pairs[:, 1] == k].tolist():
-            entries.append((j, i, max(set(paths[i]) & set(paths[j]), default=-1)))
-        if len(entries) > first:
-            stages.append((first, len(entries)))
-    middles = [model.centre for model in robot.models]
-    vertices = [model.progressive.vertex_pos[: model.progressive.vertex_count] for model in robot.models]
-    columns = np.array(entries, np.int32).reshape(-1, 3).T
-    parts = struct_of(
-        Parts,
-        device,
-        **dict(zip(("first", "second", "shared"), columns)),
-        meets=robots.meets.astype(np.uint8),
-        frame=frame,
-        depth=[len(path) for path in paths],
-        middle=middles,
-        radius=[np.sqrt(((v - m) ** 2).sum(1).max()) * (1 + 2.0**-40) for v, m in zip(vertices, middles)],
-    )
-    # A launch is one even where there is nothing to ask.
-    return LinkRequest(description.make_chain(device), parts, stages or [(0, 0)], robots.count, room)
-
-
-class RobotQuery(DeviceMemory):
+class RobotQuery(LinkQuery):
     """A fixed number of configurations as an operator: allocates once, launches many times.
 
     `launch()` only launches, so that a CUDA graph can capture it; `configurations` and the poses of what surrounds the
@@ -72,31 +30,30 @@ class RobotQuery(DeviceMemory):
     """
 
     def __init__(self, robot, around, output: str, room: int):
-        self.device, self.output, self.room = robot.device, output, room
-        self.robots = made = RobotBatch(around, robot.models, room, robot.device)
-        request = make_link_request(robot, made, room)
-        self._around, self._models = made.count, len(robot.models)
-        given = made.batch, request, max(1, PAIRS_GUESS * room)
-        kinds: dict[str, Any] = {"distance": LinkDistances, "pairs": LinkPairs}
-        self._links: Any = kinds[output](*given) if output in kinds else LinkHits(*given, output == "within")
+        super().__init__(robot, around, output, room)
+        self._world, self._models = around, len(robot.models)
+        self._world_batch, self._lods = (None, np.zeros(0)) if around is None else (around.batch(), around.lods)
         self._own_names = [robot.link_names[k] for k in robot.model_link]
-        self.nearest = self._links.nearest
-        self.configurations, self._chunk = self._links.configurations, self._links.chunk
-        self.hit = self._chunk.hit
-        self._chunk.count.fill_(room)
         self.take_poses()
 
     def take_poses(self):
-        """Read where what surrounds the robot is now. Launches only."""
-        self.robots.take_poses()
+        """Read where what surrounds the robot is now; raise RuntimeError if objects were added to it. Launches only."""
+        if self._world_batch is not None:
+            self._world_batch.check("robot query")
+            source, target = self._world_batch.objects.pool, self.batch.objects.pool
+            wp.copy(target.rotation, source.rotation, count=self.around)
+            wp.copy(target.position, source.position, count=self.around)
+
+    def is_of(self, world) -> bool:
+        """Return whether what surrounds the robot still has the same objects at the same LODs."""
+        if world is None or self._world is not world:
+            return True  # of models that were given again
+        return self._world_batch is world.batch() and np.array_equal(self._lods, world.lods)
 
     def _names(self) -> list[str]:
         """Return the names of models of the robot, of what surrounds it now, and of -1."""
-        return [*self._own_names, *self.robots.names(), ""]
-
-    def launch(self):
-        """Check all configurations. Launches only."""
-        self._links.launch()
+        around = [] if self._world_batch is None else self._world_batch.names
+        return [*self._own_names, *around, ""]
 
     def check(self):
         """Raise where the last launch lost anything, after making room for the next. Waits for the device.
@@ -105,22 +62,21 @@ class RobotQuery(DeviceMemory):
             CapacityError: A buffer overflowed; a graph is to be captured again.
             RuntimeError: There was no whole launch, see `Query.result`.
         """
-        guard = self._links.query.guard
+        guard = self.query.guard
         guard.check(guard.outcome())
-        pairs, uncertain = self._links.demand.numpy().tolist()
-        if self._links.make_room_for(pairs, uncertain):
+        pairs, uncertain = self.demand.numpy().tolist()
+        if self.make_room():
             raise CapacityError(f"{pairs} pairs of objects, {uncertain} uncertain ones of faces; launch again")
 
     def ask(self, rows: wp.array, beyond: float = np.inf) -> np.ndarray | list:
         """Return the answers of configurations, device rows (c, n), see `Robot.check`. Waits for the device."""
         self.take_poses()
+        self.most = beyond
         names = np.array(self._names() if self.nearest else [""])
         nearest, listed = np.dtype([*NEAREST_ROWS.descr, ("names", names.dtype, 2)]), []
         answers = np.empty(len(rows), nearest if self.output == "distance" else bool)
         for start in range(0, len(rows), self.room):
             count = min(self.room, len(rows) - start)
-            if self.output == "distance":
-                self._links.most = beyond
             self._run(rows, start, count)
             part = answers[start : start + count]
             if self.output == "pairs":
@@ -137,25 +93,25 @@ class RobotQuery(DeviceMemory):
 
     def _number(self, objects) -> np.ndarray:
         """Return objects as indices of models of the robot, and what surrounds it after these."""
-        return np.where(objects < self._around, objects + self._models, (objects - self._around) % self._models)
+        return np.where(objects < self.around, objects + self._models, (objects - self.around) % self._models)
 
     def _list_pairs(self, count) -> list[list[tuple[str, str]]]:
         """Return the pairs of names that intersect at each of the configurations of the last launch."""
-        pairs, names = np.concatenate(self._links.found), self._names()
+        pairs, names = np.concatenate(self.found), self._names()
         rows: list[set] = [set() for _ in range(count)]
-        places = (pairs[:, 0] - self._around) // self._models
+        places = (pairs[:, 0] - self.around) // self._models
         for place, (a, b) in zip(places.tolist(), np.sort(self._number(pairs)).tolist()):
             rows[place].add((names[a], names[b]))
         return [sorted(row) for row in rows]
 
     def _run(self, rows, first, count):
-        self._links.active = count
-        self._chunk.count.fill_(count)
+        self.active = count
+        self.chunk.count.fill_(count)
         width = self.configurations.shape[1]
         wp.copy(self.configurations, rows, src_offset=first * width, count=count * width)
-        self._links.launch()
-        while self._links.make_room_for(*self._links.demand.numpy().tolist()):
-            self._links.launch()
+        self.launch()
+        while self.make_room():
+            self.launch()
 
     def ask_spread(self, middles, halves, sizes) -> tuple[np.ndarray, np.ndarray]:
         """Return which configurations meet, and which are not proved apart for all that joint values may differ by.
@@ -166,11 +122,11 @@ class RobotQuery(DeviceMemory):
         hit, near = np.empty(len(middles), bool), np.empty(len(middles), bool)
         for start in range(0, len(middles), self.room):
             part = slice(start, start + self.room)
-            for target, values in ((self._chunk.half, halves[part]), (self._chunk.size, sizes[part])):
+            for target, values in ((self.chunk.half, halves[part]), (self.chunk.size, sizes[part])):
                 wp.copy(target, wp.array(values, dtype=wp.float64, device=self.device), count=values.size)
             count = len(middles[part])
             self._run(wp.array(middles[part], dtype=wp.float64, device=self.device), 0, count)
-            hit[part], near[part] = self.hit[:count].numpy() != 0, self._chunk.near[:count].numpy() != 0
+            hit[part], near[part] = self.hit[:count].numpy() != 0, self.chunk.near[:count].numpy() != 0
         return hit, near
 
 

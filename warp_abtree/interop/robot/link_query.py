@@ -1,125 +1,175 @@
 """Queries about the parts of a robot at a chunk of configurations, among themselves and with what surrounds them."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.arguments import whole_number
 from warp_abtree.checks.device_memory import DeviceMemory
-from warp_abtree.checks.upload import zeros_of
+from warp_abtree.checks.upload import struct_of, zeros_of
+from warp_abtree.interop.robot.surroundings import make_batch
 from warp_abtree.kernels.intersect.broad_phase import PosedBounds, pose_box_kernel
 from warp_abtree.kernels.robot import answers, forward, link_pairs
 from warp_abtree.query.request import Buffers
 from warp_abtree.query.stages.distance import DistanceQuery
 from warp_abtree.query.stages.intersect import Query
-from warp_abtree.state.batch import Batch
+from warp_abtree.state.batch import check_pairs
 
+PAIRS_GUESS = 2  # of a configuration and stage
 NO_PAIRS = np.zeros((0, 2), np.int32)
 
 
-@dataclass
-class LinkRequest:
-    """Request of a chunk's query: a robot's chain and parts, and the objects of the batch."""
+def order_parts(robot, meets) -> tuple[link_pairs.Parts, list[tuple[int, int]]]:
+    """Return parts with the entries of what is asked, those of the outermost first, and the stages of entries.
 
-    chain: forward.Chain
-    parts: link_pairs.Parts
-    stages: list[tuple[int, int]]  # (first, end) of the entries of `parts` that are asked one after the other
-    around: int  # objects of the surroundings, which come first
-    room: int  # configurations
+    A stage (first, end) are the entries of a part, asked at once.
+    """
+    description, models = robot.description, robot.models
+    frame = [description.links[robot.link_names[k]] for k in robot.model_link]
+    paths = [description.path(f) for f in frame]
+    entries, stages, pairs = [], [], check_pairs(robot.pairs, len(frame))
+    mounted = {whole_number(k, "mounted", 0, len(robot.link_names) - 1) for k in robot.mounted}
+    for k in sorted(range(len(frame)), key=lambda k: -len(paths[k])):
+        first = len(entries)
+        if len(meets) and robot.model_link[k] not in mounted:
+            entries.append((k, -1, -1))
+        for i, j in pairs[pairs[:, 1] == k].tolist():
+            entries.append((j, i, max(set(paths[i]) & set(paths[j]), default=-1)))
+        if len(entries) > first:
+            stages.append((first, len(entries)))
+    middles = [model.centre for model in models]
+    vertices = [model.progressive.vertex_pos[: model.progressive.vertex_count] for model in models]
+    parts = struct_of(
+        link_pairs.Parts,
+        robot.device,
+        **dict(zip(("first", "second", "shared"), np.array(entries, np.int32).reshape(-1, 3).T)),
+        meets=meets.astype(np.uint8),
+        frame=frame,
+        depth=[len(path) for path in paths],
+        middle=middles,
+        radius=[np.sqrt(((v - m) ** 2).sum(1).max()) * (1 + 2.0**-40) for v, m in zip(vertices, middles)],
+    )
+    return parts, stages or [(0, 0)]  # a launch is one even where there is nothing to ask
 
 
 class LinkQuery(DeviceMemory):
     """A query given no pairs: a launch poses the parts, writes the pairs of each stage, a part first, and asks it.
 
-    Stages that a configuration needs no more are empty.
-
-    Args:
-        query: `Query` or `DistanceQuery` of the batch, without pairs.
-        request: `LinkRequest`.
-        mode: Of `link_pairs`, what is asked.
-        distances: Up to where each pair matters, device float64 (pair,); None where that is 0.
+    Stages that a configuration needs no more are empty. The output is "any", "distance"; "within", which tells of what
+    does not intersect whether it is proved apart by a reach; or "pairs", read by the host after each stage, so that no
+    graph captures it.
 
     Attributes:
-        query: As given.
+        around: Objects of the surroundings, which come first in the batch.
         active: Configurations that are posed, the room by default.
-        configurations: Device float64 (room, width).
-        chunk: `link_pairs.Chunk` of device arrays.
         demand: Pairs of a stage at most, and face pairs that waited, device int32 (2,).
+        found: Of "pairs", pairs of objects that intersect, a part first, an array (k, 2) a stage.
+        most: Of "distance", what is farther apart is infinitely far.
     """
 
-    nearest: Any = None  # `answers.NearestParts`, where distances are asked
-
-    def __init__(self, query, request: LinkRequest, mode: int, distances: str | None = None):
-        self.query, self.request, self.mode, self.active = query, request, mode, request.room
-        self.batch, self.device, self._distances, batch = query.batch, query.device, distances, query.batch
-        device, room = batch.device, request.room
-        rows = room, len(request.chain.lower)
-        self.frames = zeros_of(forward.Frames, room, len(request.chain.parent), device)
-        spread, within = (rows, room) if mode == link_pairs.ASK_WITHIN else ((0, 0), 0)
-        most = room if mode == link_pairs.ASK_DISTANCE else 0
+    def __init__(self, robot, around, output: str, room: int):
+        self.device, self.output, self.room, self.active = robot.device, output, room, room
+        self.batch, meets = make_batch(around, robot.models, room, robot.device)
+        self.around = len(meets)
+        self.chain = robot.description.make_chain(self.device)
+        self.parts, self.stages = order_parts(robot, meets)
+        device, batch, rows = self.device, self.batch, (room, len(self.chain.lower))
+        buffers, is_within = Buffers(pairs=max(1, PAIRS_GUESS * room)), output == "within"
+        self.found, self.most, self.nearest = [], np.inf, None
+        modes = {"distance": link_pairs.ASK_DISTANCE, "within": link_pairs.ASK_WITHIN}
+        self._mode = int(modes.get(output, link_pairs.ASK_ANY))
+        self._reach = {"distance": "beyond", "within": "within"}.get(output)  # array of how far each pair matters
+        self.query: Any
+        if output == "distance":
+            self.query = DistanceQuery(batch, NO_PAIRS, buffers)
+            self.nearest = zeros_of(answers.NearestParts, room, 0, device)
+        else:
+            self.query = Query(batch, "any", NO_PAIRS, buffers, within=0.0 if is_within else None)
+        self.frames = zeros_of(forward.Frames, room, len(self.chain.parent), device)
+        spread, near, most = rows if is_within else (0, 0), room * is_within, room * (output == "distance")
         self.chunk = link_pairs.Chunk()
-        sizes: dict[str, Any] = dict(count=1, half=spread, size=spread, hit=room, near=within, best=most)
+        sizes: dict[str, Any] = dict(count=1, half=spread, size=spread, hit=room, near=near, best=most)
         for name, shape in sizes.items():
-            dtype = link_pairs.Chunk.vars[name].type.dtype
-            setattr(self.chunk, name, wp.zeros(shape, dtype=dtype, device=device))
-        self.configurations = wp.zeros(rows, dtype=wp.float64, device=device)
+            setattr(self.chunk, name, wp.zeros(shape, dtype=link_pairs.Chunk.vars[name].type.dtype, device=device))
+        self.chunk.count.fill_(room)
+        self.hit, self.configurations = self.chunk.hit, wp.zeros(rows, dtype=wp.float64, device=device)
         self.demand = wp.zeros(2, dtype=wp.int32, device=device)
-        self.boxes, around = link_pairs.LinkBoxes(), request.around
+        self._boxes, self._bounds, count = link_pairs.LinkBoxes(), PosedBounds(), self.around
         for name in ("lower", "upper"):
-            setattr(self.boxes, name, wp.zeros(batch.object_count, dtype=wp.vec3, device=device))
-        self._bounds = PosedBounds()
-        self._bounds.lower, self._bounds.upper = self.boxes.lower, self.boxes.upper
+            corners = wp.zeros(batch.object_count, dtype=wp.vec3, device=device)
+            setattr(self._boxes, name, corners)
+            setattr(self._bounds, name, corners)
         self._bounds.pair_count = wp.zeros(1, dtype=wp.int32, device=device)
-        self.bvh = wp.Bvh(self.boxes.lower[:around], self.boxes.upper[:around]) if around else None
-        self.boxes.bvh = wp.uint64(0) if self.bvh is None else self.bvh.id
+        self._bvh = wp.Bvh(self._boxes.lower[:count], self._boxes.upper[:count]) if count else None
+        self._boxes.bvh = wp.uint64(0) if self._bvh is None else self._bvh.id
 
     def place(self):
         """Pose the parts of all configurations, and box all objects. Launches only."""
-        request, device = self.request, self.device
-        parts, around = request.parts.frame, request.around
-        inputs = [request.chain, self.configurations, self.frames]
+        device, batch, around, parts = self.device, self.batch, self.around, self.parts.frame
+        inputs = [self.chain, self.configurations, self.frames]
         wp.launch(forward.forward_kernel, self.active, inputs, device=device)
-        inputs = [around, parts, self.frames, self.batch.objects.pool]
+        inputs = [around, parts, self.frames, batch.objects.pool]
         wp.launch(forward.place_part_kernel, (self.active, len(parts)), inputs, device=device)
-        inputs = [self.batch.trees, self.query.guard.record(), 0.0, None, self._bounds]
+        inputs = [batch.trees, self.query.guard.record(), 0.0, None, self._bounds]
         wp.launch(pose_box_kernel, around + self.active * len(parts), inputs, device=device)
-        if self.bvh is not None:
-            self.bvh.rebuild()
-        self.chunk.hit.zero_()
+        if self._bvh is not None:
+            self._bvh.rebuild()
+        self.hit.zero_()
         self.chunk.near.zero_()
 
     def launch(self):
-        """Launch all stages. Launches only."""
-        query = self.query
+        """Check all configurations. Launches only."""
+        query, around = self.query, self.around
         query.check_scene()
         with query.guard.launching(self):
-            self._begin()
+            self._forget()
             self.place()
-            for stage in self.request.stages:
+            distances = None if self._reach is None else query.distances_of(self._reach)
+            for stage in self.stages:
                 query.pair_count.zero_()
-                self._find_pairs(stage)
+                inputs = [self._mode, wp.vec2i(*stage), around, self.chain, self.parts, self.frames]
+                inputs += [self._boxes, self.chunk, query.pair_batch, distances]
+                wp.launch(link_pairs.find_link_pair_kernel, self.active, inputs, device=self.device)
                 query.search()
-                self._note([self.request.around, len(self.request.parts.frame), query.pair_batch])
+                self._note([around, len(self.parts.frame), query.pair_batch])
 
-    def _find_pairs(self, stage):
-        request, query = self.request, self.query
-        distances = None if self._distances is None else query.distances_of(self._distances)
-        inputs = [self.mode, wp.vec2i(*stage), request.around, request.chain, request.parts, self.frames]
-        inputs += [self.boxes, self.chunk, query.pair_batch, distances]
-        wp.launch(link_pairs.find_link_pair_kernel, self.active, inputs, device=self.device)
-
-    def _begin(self):
+    def _forget(self):
         """Forget the answers of the last launch. Launches only."""
         self.demand.zero_()
+        self.found.clear()
+        if self.nearest is not None:
+            self.chunk.best.fill_(self.most)
+            self.nearest.distance.fill_(np.inf)
+            self.nearest.points.fill_(np.nan)
+            self.nearest.faces.fill_(wp.vec2i(-1, -1))
+            self.nearest.pair.fill_(wp.vec2i(-1, -1))
 
     def _note(self, found: list):
-        """Reduce the answers of a stage's pairs to those of configurations. Launches only."""
-        raise NotImplementedError
+        """Reduce the answers of a stage's pairs to those of configurations. Launches only, but for "pairs"."""
+        query, chunk, nearest = self.query, self.chunk, self.nearest
+        if nearest is None:
+            near = None if query.near is None else query.near.any_hit
+            steps = [(answers.note_hit_kernel, [query.hits, near, chunk, self.demand])]
+        else:
+            nearest.winner.fill_(int(answers.NO_PAIR))
+            steps = [
+                (answers.note_distance_kernel, [query.hits, query.distances, chunk, self.demand]),
+                (answers.find_winner_kernel, [query.distances, chunk, nearest]),
+                (answers.write_nearest_kernel, [query.distances, nearest, chunk]),
+            ]
+        for kernel, inputs in steps:
+            wp.launch(kernel, len(query.pairs), [*found, *inputs], device=self.device)
+        if nearest is not None:
+            query.forget()
+        elif self.output == "pairs":
+            self.hit.zero_()  # later stages are asked, too
+            pairs = query.pairs.numpy()[: query.pair_count.numpy()[0]]
+            self.found.append(pairs[query.hits.any_hit.numpy()[: len(pairs)] != 0])
 
-    def make_room_for(self, pairs: int, uncertain: int) -> bool:
-        """Make room for a demand, and return whether there was too little."""
-        rooms, wanted = self.query.rooms, {}
+    def make_room(self) -> bool:
+        """Make room for the demand of the last launch; return whether there was too little. Waits for the device."""
+        (pairs, uncertain), rooms, wanted = self.demand.numpy().tolist(), self.query.rooms, {}
         if pairs > rooms.pairs:
             wanted["pairs"] = pairs + pairs // 4
         if 0 < rooms.uncertain < uncertain:
@@ -127,74 +177,3 @@ class LinkQuery(DeviceMemory):
         if wanted:
             self.query.make_room(**wanted)
         return bool(wanted)
-
-
-class LinkHits(LinkQuery):
-    """Which configurations have parts that intersect; with proofs, also which have all proved apart by a reach."""
-
-    def __init__(self, batch: Batch, request: LinkRequest, capacity: int, proves: bool):
-        query = Query(batch, "any", NO_PAIRS, Buffers(pairs=capacity), within=0.0 if proves else None)
-        mode = int(link_pairs.ASK_WITHIN if proves else link_pairs.ASK_ANY)
-        super().__init__(query, request, mode, "within" if proves else None)
-
-    def _note(self, found):
-        query = self.query
-        inputs = [*found, query.hits, None if query.near is None else query.near.any_hit, self.chunk, self.demand]
-        wp.launch(answers.note_hit_kernel, len(query.pairs), inputs, device=self.device)
-
-
-class LinkPairs(LinkHits):
-    """Which parts intersect at each configuration: read by the host after each stage, so that no graph captures it.
-
-    Attributes:
-        found: Pairs of objects that intersect, a part first, arrays (k, 2).
-    """
-
-    found: list[np.ndarray]
-
-    def __init__(self, batch: Batch, request: LinkRequest, capacity: int):
-        super().__init__(batch, request, capacity, False)
-
-    def _begin(self):
-        super()._begin()
-        self.found = []
-
-    def _note(self, found):
-        super()._note(found)
-        self.chunk.hit.zero_()  # later stages are asked, too
-        pairs = self.query.pairs.numpy()[: self.query.pair_count.numpy()[0]]
-        self.found.append(pairs[self.query.hits.any_hit.numpy()[: len(pairs)] != 0])
-
-
-class LinkDistances(LinkQuery):
-    """How far apart the nearest parts of each configuration are, or a part and its surroundings, and where.
-
-    Attributes:
-        most: What is farther apart is infinitely far.
-    """
-
-    most = np.inf
-
-    def __init__(self, batch: Batch, request: LinkRequest, capacity: int):
-        self.nearest = zeros_of(answers.NearestParts, request.room, 0, batch.device)
-        query = DistanceQuery(batch, NO_PAIRS, Buffers(pairs=capacity))
-        super().__init__(query, request, int(link_pairs.ASK_DISTANCE), "beyond")
-
-    def _begin(self):
-        super()._begin()
-        self.chunk.best.fill_(self.most)
-        self.nearest.distance.fill_(np.inf)
-        self.nearest.points.fill_(np.nan)
-        self.nearest.faces.fill_(wp.vec2i(-1, -1))
-        self.nearest.pair.fill_(wp.vec2i(-1, -1))
-
-    def _note(self, found):
-        query = self.query
-        self.nearest.winner.fill_(int(answers.NO_PAIR))
-        for kernel, inputs in (
-            (answers.note_distance_kernel, [query.hits, query.distances, self.chunk, self.demand]),
-            (answers.find_winner_kernel, [query.distances, self.chunk, self.nearest]),
-            (answers.write_nearest_kernel, [query.distances, self.nearest, self.chunk]),
-        ):
-            wp.launch(kernel, len(query.pairs), [*found, *inputs], device=self.device)
-        query.forget()

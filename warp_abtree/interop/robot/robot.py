@@ -100,12 +100,9 @@ class Robot:
         """Load a robot from a URDF (.urdf, by yourdfpy) or MJCF file (.xml, by MuJoCo).
 
         Joints may be fixed, revolute, continuous, prismatic, and mimic others; planar, floating and free ones have
-        values "joint/x" and so on (`description.COORDINATES`). Of URDF, revolute and prismatic ones must have limits, 0
-        where one of two is not given. Tested against one another are all links but those that are rigidly joined, that
-        a joint joins, a floating one apart, or that the file or the SRDF excludes. Of MJCF, "collision" has MuJoCo's
-        pairs: by contype, conaffinity, `contact/exclude` and `contact/pair`, and links on a joint are tested against
-        what it hangs on where that stands still, or with `filterparent` disabled. Meshes of a URDF are mirrored by
-        negative scales; those of Collada are scaled by their unit to meters, their up axis is ignored, as in RViz.
+        values "joint/x" and so on (`description.COORDINATES`). Tested against one another are all links but those that
+        are rigidly joined, that a joint joins, a floating one apart, or that the file or the SRDF excludes; of MJCF,
+        "collision" has MuJoCo's pairs. The guide on robots tells all that is read of the files.
 
         Args:
             geometry: "collision" or "visual" meshes; boxes, cylinders and the like are tessellated. Of MJCF, "visual"
@@ -121,9 +118,7 @@ class Robot:
             base: Pose of the file's root in the world, 7 numbers or a rigid (4, 4), as for `Scene.add`.
             locked: Values of joints that are fixed at them, by name, and no longer of a configuration.
 
-        Warns of what ties links beside their joints and is not enforced: of MJCF `equality` other than between joints,
-        and limits of tendons; of URDF joints of Gazebo's and Drake's elements. And of what is not read: macros of xacro
-        that are not expanded, unknown elements of an SRDF. An MJCF file that disables contacts is asked all the same.
+        Warns of what ties links beside their joints, which is not enforced, and of elements that are not read.
 
         Raises:
             ImportError: The extra `robot` is not installed.
@@ -381,7 +376,7 @@ class Robot:
         rooms = ROOMS["cpu" if self.device.is_cpu else "cuda"]
         room = next((room for room in rooms if room >= count), rooms[-1])
         query = self._kept.pop((key, output, room), None)
-        if query is None or not query.robots.is_of(around):
+        if query is None or not query.is_of(around):
             query = RobotQuery(self, around, output, room)
         self._kept[key, output, room] = query
         for old in list(self._kept)[:-KEPT]:

@@ -1,7 +1,6 @@
 """Surroundings of a robot: objects of a scene or models, in one batch with the robots of a chunk."""
 
 import numpy as np
-import warp as wp
 
 from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.model.model import Model
@@ -40,49 +39,23 @@ def make_surroundings(world, device) -> tuple[Scene | None, tuple]:
     return (scene if placed else None), tuple((id(model), pose.tobytes()) for model, pose in placed)
 
 
-class RobotBatch:
-    """The batch of what surrounds a robot, a `Scene` at its LODs or None, and of the parts of a number of robots.
+def make_batch(around: Scene | None, models: list[Model], room: int, device) -> tuple[Batch, np.ndarray]:
+    """Return the batch of what surrounds a robot, a scene at its LODs or None, and then of the parts of many robots.
 
-    Attributes:
-        batch: `Batch`; objects of the surroundings come first.
-        count: Objects of the surroundings.
-        meets: Whether the bits of each of these let it meet the robot, whose group is 1, with every bit in its mask.
+    With it goes whether the bits of each object around let it meet the robot, whose group is 1, with every bit in its
+    mask.
     """
-
-    def __init__(self, around: Scene | None, models: list[Model], room: int, device):
-        posed = Scene(device)
-        self.count, solid = 0, np.zeros(0, bool)
-        self._around, self._batch, self._lods = around, None, np.zeros(0)
-        self.meets = np.zeros(0, bool)
-        if around is not None:
-            self.count, self._batch, self._lods = around.object_count, around.batch(), around.lods
-            posed.add_many([around.models[m] for m in around.object_model], [STILL] * self.count, lods=self._lods)
-            solid = np.array(around.object_solid)
-            group, mask = self._batch.objects.collision_bits.numpy().reshape(-1, 2).T
-            self.meets = (group != 0) & ((mask & 1) != 0) if len(group) else np.ones(self.count, bool)
-        posed.add_many(models, [STILL] * len(models))
-        once = posed.batch()
-        chosen = np.concatenate([np.arange(self.count), np.tile(np.arange(self.count, once.object_count), room)])
-        none = np.zeros(len(chosen))
-        objects = ObjectArrays(none, none, device)
-        objects.set_states(once.objects.state[chosen])
-        solids = np.concatenate([solid, np.zeros(len(chosen) - self.count, bool)]) if solid.any() else ()
-        self.batch = Batch(once.models, once.states, objects, once.object_model[chosen], solid=solids)
-
-    def is_of(self, around: Scene | None) -> bool:
-        """Return whether the surroundings still have the same objects at the same LODs."""
-        if around is None or self._around is not around:
-            return True  # of models that were given again
-        return self._batch is around.batch() and np.array_equal(self._lods, around.lods)
-
-    def names(self) -> list[str]:
-        """Return the names of the objects of the surroundings."""
-        return [] if self._batch is None else self._batch.names
-
-    def take_poses(self):
-        """Copy the poses of what surrounds the robot; raise RuntimeError if objects were added to it. Launches only."""
-        if self._batch is not None:
-            self._batch.check("robot query")
-            source, target = self._batch.objects.pool, self.batch.objects.pool
-            wp.copy(target.rotation, source.rotation, count=self.count)
-            wp.copy(target.position, source.position, count=self.count)
+    posed, solid, meets = Scene(device), np.zeros(0, bool), np.zeros(0, bool)
+    if around is not None:
+        posed.add_many([around.models[m] for m in around.object_model], [STILL] * around.object_count, lods=around.lods)
+        solid = np.array(around.object_solid)
+        group, mask = around.batch().objects.collision_bits.numpy().reshape(-1, 2).T
+        meets = (group != 0) & ((mask & 1) != 0) if len(group) else np.ones(len(solid), bool)
+    posed.add_many(models, [STILL] * len(models))
+    once = posed.batch()
+    chosen = np.concatenate([np.arange(len(meets)), np.tile(np.arange(len(meets), once.object_count), room)])
+    none = np.zeros(len(chosen))
+    objects = ObjectArrays(none, none, device)
+    objects.set_states(once.objects.state[chosen])
+    solids = np.concatenate([solid, np.zeros(len(chosen) - len(solid), bool)]) if solid.any() else ()
+    return Batch(once.models, once.states, objects, once.object_model[chosen], solid=solids), meets

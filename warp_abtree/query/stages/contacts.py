@@ -293,7 +293,7 @@ class ContactStage(Stage):
 def plan_contacts(precision, within, gap, sums: bool, dtype: Any = np.float64, memory=None) -> list[Stage]:
     """Return the stages that find contacts and their summaries, or those that are reduced to points.
 
-    memory is the stage that finds the pairs that rest, or None.
+    memory is the stage that finds the pairs that rest, the gap itself if it knows, or None.
 
     Raises:
         ValueError: An unknown precision.
@@ -306,7 +306,7 @@ def plan_contacts(precision, within, gap, sums: bool, dtype: Any = np.float64, m
         gaps = gap if isinstance(gap, GapStage) else GapStage(gap)
         gaps.give_to(intersect.hits, precision)
         apart.append(gaps)
-    if memory is not None:
+    if memory is not None and memory is not gap:
         apart.append(memory)
     reduced: list[Stage] = [] if slots is None else [slots]
     return [*apart, intersect, *reduced, InsideStage(), ContactStage(precision, gap is not None and sums, sums, dtype)]

@@ -33,14 +33,17 @@ class Originals:
 
 
 class OriginalStage(Stage):
-    """Move contact points found at LODs to the original surfaces."""
+    """Move contact points found at LODs to the original surfaces, of which `finest` is a batch; None makes one."""
 
     poses: Any  # of the originals of each pair, device `PairPose` (pair,)
+
+    def __init__(self, finest: Batch | None = None):
+        self.finest: Any = finest
 
     def attach(self, operator: Operator):
         """Take the operator, and make the tree states."""
         super().attach(operator)
-        self._finest = make_finest(operator.batch)
+        self.finest = self.finest or make_finest(operator.batch)
 
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return the poses."""
@@ -48,7 +51,7 @@ class OriginalStage(Stage):
 
     def project(self, gap: Any, faces: Any, rows: Any, manifolds: Any):
         """Move the points, of which `manifolds` has the witnesses. Launches only."""
-        operator, trees = self.operator, self._finest.trees
+        operator, trees = self.operator, self.finest.trees
         asked, room, launch = operator.pair_batch, operator.rooms.pairs, operator.launch_kernel
         launch(originals.pose_original_kernel, room, [trees, asked, self.poses])
         inputs = [operator.batch.trees, trees, asked, self.poses, faces, rows, manifolds]

@@ -52,9 +52,11 @@ from warp_abtree.kernels.contacts import column, contact, loops, manifold, near_
 from warp_abtree.kernels.contacts import points as point_kernels
 from warp_abtree.kernels.inside import inside_points, nearest_contacts
 from warp_abtree.query.operator import Operator
+from warp_abtree.query.point_parts import PartGaps, PointParts, needs_parts
 from warp_abtree.query.result import VECTORS, Found, Result
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
 from warp_abtree.query.stages.contacts import ContactStage, plan_contacts, warn_of_winding
+from warp_abtree.query.stages.intersect import GapStage
 from warp_abtree.query.stages.memory import MemoryStage, check_remember
 from warp_abtree.query.stages.originals import OriginalStage
 from warp_abtree.query.stages.slots import SlotStage
@@ -258,16 +260,81 @@ class ManifoldQuery(Operator):
         self.point_max = whole_number(points, "points", 1, 64)
         distance = check_remember(remember, gap)
         self.memory = None if distance is None else MemoryStage(distance, self.point_max)
-        stages = plan_contacts(precision, None, gap, sums=False, memory=self.memory)
-        contacts: Any = stages[-1]
-        slots: Any = next(stage for stage in stages if isinstance(stage, SlotStage))
-        surfaces = OriginalStage() if flag(originals, "originals") else None
-        found = PointStage(slots, contacts, gap is not None, self.point_max, self.memory, surfaces)
-        stages += [found] if surfaces is None else [surfaces, found]
-        self.contacts, self.manifolds, self.curves = contacts.contacts, found.manifolds, found.curves
-        self.witnesses, self.witness_rows, self.near_contacts = found.witnesses, slots.rows, found.near
+        self._precision, self._originals = precision, OriginalStage() if flag(originals, "originals") else None
+        stages = self._plan(gap, self.memory, self.memory, self._originals)
+        self._name_arrays(stages)
+        self.manifolds = stages[-1].manifolds
         warn_of_winding(scene)
         super().__init__(scene, stages, pairs, capacity, "faces", sort_pairs=True)
+        kinds = GapStage, MemoryStage
+        self._before_parts = [stage for stage in stages if isinstance(stage, kinds)]
+
+    def _plan(self, gap, resting, memory, surfaces) -> list[Any]:
+        """Return the stages of the query or, with another gap and without memory, of its parts."""
+        stages: list[Any] = plan_contacts(self._precision, None, gap, sums=False, memory=resting)
+        slots = next(stage for stage in stages if isinstance(stage, SlotStage))
+        found = PointStage(slots, stages[-1], gap is not None, self.point_max, memory, surfaces)
+        return [*stages, found] if surfaces is None else [*stages, surfaces, found]
+
+    def _name_arrays(self, stages):
+        """Take what users read from the stages that contacts are found by."""
+        kinds: Any = {type(stage): stage for stage in stages}
+        slots, contacts, found = kinds[SlotStage], kinds[ContactStage], kinds[PointStage]
+        self.contacts, self.curves, self.witness_rows = contacts.contacts, found.curves, slots.rows
+        self.witnesses, self.near_contacts = found.witnesses, found.near
+
+    @property
+    def list_rooms(self) -> Rooms:
+        """Return the room of the lists that hits are found in, those of one part of the pairs at a time."""
+        return self.rooms if self.parts is None else self.rooms._replace(**self.parts.list_rooms())
+
+    def make_list_room(self, hits=None, uncertain=None):
+        """Make room for longer lists; those beyond some length serve parts of the pairs, one after the other."""
+        some = None if hits is None else hits // self.growth * 5 // 4  # of lists that are long
+        if self.parts is not None:
+            self.parts.make_room(some, uncertain)
+        elif needs_parts(self.rooms.pairs, some or 0, uncertain or 0):
+            gap = None if self.hits.gap is None else PartGaps()
+            surfaces = None if self._originals is None else OriginalStage(self._originals.finest)
+            stages = self._plan(gap, None if self.memory is None else gap, None, surfaces)
+            self.parts = PointParts(self, stages, some or self.rooms.hits, uncertain or self.rooms.uncertain)
+        else:
+            super().make_list_room(hits, uncertain)
+            return
+        self._link_parts()
+
+    def _link_parts(self):
+        """Take note of new arrays of the parts."""
+        self.guard.buffers.advance()
+        with self.changing():
+            self.parts.lend_lists(self.hits)
+            self._name_arrays(self.parts.operator.stages)
+            self.faces, self.start = self.parts.operator.faces, self.parts.operator.start
+
+    def _replace(self, made, rooms: Rooms):
+        super()._replace(made, rooms)
+        if self.parts is not None:
+            self._link_parts()
+
+    def search(self):
+        """Search the pairs in place; of parts, each is reduced to points before the next. Launches only."""
+        if self.parts is None or not self.rooms.pairs:
+            super().search()
+            return
+        if self.parts.fit_states():
+            self._link_parts()
+        for stage in self._before_parts:
+            stage.search()
+        self.parts.launch(self, None if self.memory is None else self.memory.asked)
+        if self.memory is not None:
+            self.memory.resume()
+
+    def report(self, count: int | None = None):
+        """Reduce what was found to points. Launches only."""
+        if self.parts is None:
+            super().report(count)
+        elif self.memory is not None and self.rooms.pairs:
+            self.memory.keep(self.manifolds)
 
     def set_pairs(self, pairs, within=None, gap=None):
         """Query other pairs from now on, as `ContactQuery.set_pairs`; there is no within."""

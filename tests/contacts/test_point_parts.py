@@ -1,0 +1,166 @@
+"""Contact points found part by part, in short lists: the same bytes as in lists for all pairs at once."""
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from helpers.bodies import about, model_of
+
+import warp_abtree as ab
+from warp_abtree import testing
+from warp_abtree.query import point_parts
+
+GAP, SIDE = 0.06, 5
+BALL = model_of(trimesh.creation.icosphere(subdivisions=3, radius=0.52))
+RING = model_of(trimesh.creation.torus(0.4, 0.16))
+
+
+@pytest.fixture(params=["warps", "threads"])
+def regime(request, device):
+    """Search by warps, which list what is near; on the CPU also by threads, which do not."""
+    if request.param == "threads" and device != "cpu":
+        pytest.skip("threads are the CPU's")
+    with testing.regime(warps=request.param == "warps"):
+        yield
+
+
+def grid(device, solids=False):
+    """Return a scene of balls and rings that just reach their neighbours, turned at random, and their poses."""
+    rng, scene = np.random.default_rng(1), ab.Scene(device)
+    places = np.stack(np.meshgrid(*[np.arange(SIDE)] * 2, [0]), -1).reshape(-1, 3) * 0.95
+    poses = [[*(place + rng.normal(size=3) * 0.01), *about(rng.normal(size=3), 3.0)] for place in places]
+    scene.add_many([(BALL, RING)[i % 3 == 0] for i in range(len(places))], poses, solids=solids)
+    return scene, np.array(poses)
+
+
+def bytes_of(result):
+    """Return the bytes of what a result has, by name, but for its counts of tests."""
+    made = {"pairs": result.pairs, "any": result.any, "count": result.count, **result.points}
+    return {name: np.ascontiguousarray(array).tobytes() for name, array in made.items()}
+
+
+def shorten_lists(monkeypatch, hits=300, uncertain=2000):
+    """Let longer lists serve parts of the pairs."""
+    monkeypatch.setattr(point_parts, "HITS_AT_ONCE", hits)
+    monkeypatch.setattr(point_parts, "UNCERTAIN_AT_ONCE", uncertain)
+
+
+def both(monkeypatch, make, rounds):
+    """Return what a query finds whole and in parts, of each round, which moves objects; and the query in parts."""
+    found = []
+    for at_once in ((10**9, 10**9), (300, 2000)):
+        shorten_lists(monkeypatch, *at_once)
+        scene, poses, query = make()
+        own = []
+        for move in range(rounds):
+            shift = np.sin(np.arange(3 * len(poses))).reshape(-1, 3) * (np.arange(len(poses)) % 2)[:, None]
+            scene.set_poses(poses + np.pad(0.02 * move * shift, ((0, 0), (0, 4))))
+            own.append(bytes_of(query.run()))
+        found.append(own)
+    return *found, query
+
+
+OPTIONS = {
+    "crossing": {},
+    "gap": {"gap": GAP},
+    "remembered": {"gap": GAP, "remember": 0.01},
+    "originals": {"gap": GAP, "originals": True},
+    "many points": {"gap": GAP, "points": 32},
+}
+
+
+@pytest.mark.parametrize("given", [False, True], ids=["broad phase", "given"])
+@pytest.mark.parametrize("solids", [False, True], ids=["surfaces", "solids"])
+@pytest.mark.parametrize("name", OPTIONS)
+@pytest.mark.usefixtures("regime")
+def test_parts_find_the_same_bytes(device, monkeypatch, name, solids, given):
+    """Whatever is asked, over rounds in which some pairs rest and others do not."""
+
+    def make():
+        scene, poses = grid(device, solids)
+        if "originals" in OPTIONS[name]:
+            scene.set_lods([scene.models[k].lod_max // 2 for k in scene.batch().object_model])
+        pairs = scene.intersect(output="any", within=GAP).pairs[::-1] if given else None
+        return scene, poses, ab.ManifoldQuery(scene, pairs, ab.Buffers(100, None, 100), **OPTIONS[name])
+
+    whole, parted, query = both(monkeypatch, make, 3)
+    assert whole == parted
+    assert query.parts is not None and query.parts.operator.rooms.pairs < query.rooms.pairs
+
+
+def ask_in_parts(device, monkeypatch, **options):
+    """Return a scene, its poses, and a query of it in parts, after its first round."""
+    shorten_lists(monkeypatch, 300, 8000)
+    scene, poses = grid(device)
+    query = ab.ManifoldQuery(scene, None, ab.Buffers(100, 200, 100), gap=GAP, **options)
+    query.run()
+    return scene, poses, query
+
+
+@pytest.mark.usefixtures("regime")
+def test_lists_of_parts_that_are_too_short_tell_and_grow(device, monkeypatch):
+    """A launch tells what it lacked; a run makes parts smaller until lists suffice, down to one pair."""
+    scene, poses, query = ask_in_parts(device, monkeypatch)
+    size, alike = query.parts.operator.rooms.pairs, query.run()
+    poses[:, :3] *= 0.8
+    scene.set_poses(poses)
+    query.launch()
+    with pytest.raises(ab.CapacityError, match="the query has room for"):
+        query.result().check()
+    closer = query.run()
+    assert closer.count.sum() > 2 * alike.count.sum() and query.parts.operator.rooms.pairs < size
+    shorten_lists(monkeypatch, 10, 10)
+    one = ab.ManifoldQuery(scene, None, ab.Buffers(10, None, 10), gap=GAP)
+    assert bytes_of(one.run()) == bytes_of(closer) and one.parts.operator.rooms.pairs == 1
+    assert len(one.hits.face) >= closer.count.max()
+
+
+def test_more_pairs_than_before_are_more_parts(device, monkeypatch):
+    """Where the broad phase outgrows its room the parts go on in arrays that are new."""
+    shorten_lists(monkeypatch)
+    scene, poses = grid(device)
+    apart = poses.copy()
+    apart[:-3, :3] *= 3
+    scene.set_poses(apart)
+    query = ab.ManifoldQuery(scene, None, ab.Buffers(10, 2, 10), gap=GAP)
+    few = query.run()
+    scene.set_poses(poses)
+    found = query.run()
+    assert len(few.pairs) < len(found.pairs) > 20 and query.parts is not None
+    shorten_lists(monkeypatch, 10**9, 10**9)
+    assert bytes_of(found) == bytes_of(ab.ManifoldQuery(scene, gap=GAP).run())
+
+
+def test_parts_are_in_graphs(monkeypatch):
+    """A captured launch replays at other poses; one from before the lists grew has no result."""
+    if not wp.is_cuda_available():
+        pytest.skip("no GPU")
+    scene, poses, query = ask_in_parts("cuda:0", monkeypatch, remember=0.01)
+    with wp.ScopedCapture("cuda:0") as capture:
+        query.launch()
+    scene.set_poses(poses + [0.01, 0, 0, 0, 0, 0, 0])
+    query.forget()
+    wp.capture_launch(capture.graph)
+    replayed = bytes_of(query.result())
+    query.forget()
+    assert replayed == bytes_of(query.run())
+    query.make_list_room(hits=4 * query.list_rooms.hits)
+    wp.capture_launch(capture.graph)
+    with pytest.raises(RuntimeError, match="no result"):
+        query.result()
+
+
+def test_bodies_move_alike_in_parts(device, monkeypatch):
+    """A heap falls to the same bytes, whatever the lists."""
+
+    def fall():
+        scene, _poses = grid(device, solids=True)
+        bodies = ab.Dynamics(scene, capacity=ab.Buffers(100, None, 100))
+        for _ in range(6):
+            bodies.step(0.01)
+        return scene.poses.tobytes(), bodies.query.parts is not None
+
+    whole, parted = fall()
+    assert not parted
+    shorten_lists(monkeypatch, 300, 300)
+    assert fall() == (whole, True)

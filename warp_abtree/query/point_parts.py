@@ -1,0 +1,121 @@
+"""Parts of a query's object pairs that take turns in the lists of an operator of its own, so that memory is bounded.
+
+Pairs do not depend on one another: whatever the parts, each has the same contact points, to the bit.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels.io import point_parts as kernels
+from warp_abtree.query.operator import Operator
+from warp_abtree.query.request import Buffers
+from warp_abtree.query.stage import Array, Rooms, Stage
+from warp_abtree.query.stages.intersect import GapStage
+
+# Entries of the lists of hits, and of face pairs that may be near, beyond which parts of the pairs take turns: some 500
+# and 600 MB.
+HITS_AT_ONCE, UNCERTAIN_AT_ONCE = 2**21, 2**25
+
+
+class PartGaps(GapStage):
+    """Gaps of a part's pairs, which the query gives it.
+
+    Attributes:
+        asked: What the traversal takes for them, device float64 (pair,).
+    """
+
+    asked: wp.array
+
+    def __init__(self):
+        super().__init__(None)
+
+    def attach(self, operator: Any):
+        """Take the operator."""
+        Stage.attach(self, operator)
+
+    def arrays(self, rooms: Rooms) -> list[Array]:
+        """Return the gaps, twice."""
+        return [*super().arrays(rooms), Array(self, "asked", wp.float64, max(1, rooms.pairs))]
+
+
+def needs_parts(pairs: int, hits: int, uncertain: int) -> bool:
+    """Return whether lists of so many entries are for parts of the pairs."""
+    return pairs > 1 and (hits > HITS_AT_ONCE or uncertain > UNCERTAIN_AT_ONCE)
+
+
+class PointParts:
+    """An operator that finds contact points of one part of a query's pairs after the other.
+
+    Args:
+        query: `ManifoldQuery` whose lists are too short.
+        stages: Of the operator, those of a query with gaps of its own.
+        hits, uncertain: Entries that the query's lists would need.
+
+    Attributes:
+        operator: The operator, whose lists hold those of the last part.
+    """
+
+    def __init__(self, query: Any, stages: list[Any], hits: int, uncertain: int):
+        parts = max(-(-hits // HITS_AT_ONCE), -(-uncertain // UNCERTAIN_AT_ONCE))
+        rooms = Buffers(
+            min(hits, HITS_AT_ONCE), -(-query.rooms.pairs // parts), min(uncertain, UNCERTAIN_AT_ONCE) or None
+        )
+        self._gaps = next((stage for stage in stages if isinstance(stage, PartGaps)), None)
+        self._points = stages[-1]
+        # Its pairs are written on the device.
+        self.operator = Operator(query.batch, stages, np.array([[0, 1]], np.int32), rooms, "faces")
+
+    def list_rooms(self) -> dict[str, int]:
+        """Return the room of the lists by name."""
+        return {name: getattr(self.operator.rooms, name) for name in ("hits", "uncertain")}
+
+    def fit_states(self) -> bool:
+        """Make room for tree states that are new; return whether that took new arrays."""
+        before = self.operator.guard.buffers.number
+        self.operator.fit_states()
+        return self.operator.guard.buffers.number != before
+
+    def lend_lists(self, hits: Any):
+        """Let hits of the query have the lists of the parts, whose totals it then has."""
+        for name in ("face", "uncertain", "inexact", "apart"):
+            setattr(hits, name, getattr(self.operator.hits, name))
+
+    def make_room(self, hits: int | None, uncertain: int | None):
+        """Make room for longer lists of a part, or where these are long enough, make parts of half of the pairs."""
+        rooms, most = self.operator.rooms, {"hits": HITS_AT_ONCE, "uncertain": UNCERTAIN_AT_ONCE}
+        wanted = {name: room for name, room in (("hits", hits), ("uncertain", uncertain)) if room is not None}
+        within = {name: max(getattr(rooms, name), min(room, most[name])) for name, room in wanted.items()}
+        if rooms.pairs == 1:
+            self.operator.make_room(**wanted)
+        elif any(within[name] > getattr(rooms, name) for name in wanted):
+            self.operator.make_room(**within)
+        else:
+            self.operator.make_room(pairs=-(-rooms.pairs // 2))
+
+    def launch(self, query: Any, asked: Any):
+        """Find the contact points of all pairs that a query has room for. Launches only.
+
+        Args:
+            query: The query.
+            asked: What the traversal takes for gaps, device float64 (pair,); None for the gaps.
+        """
+        operator, size, gaps = self.operator, self.operator.rooms.pairs, self._gaps
+        none, record = wp.empty(0, dtype=wp.float64, device=operator.device), query.guard.record()
+        gap, own = (none, (none, none)) if gaps is None else (query.hits.gap, (operator.hits.gap, gaps.asked))
+        taken = query.pair_batch, gap, none if asked is None else asked, query.hits, operator.pair_batch, *own
+        put = operator.pair_batch, operator.hits, self._points.manifolds, query.hits, query.manifolds
+
+        def launch(kernel, first, dim, inputs):
+            def make(launch):
+                return [launch(kernel, dim=dim, inputs=inputs, device=operator.device)]
+
+            for command in operator.find_launches(f"{kernel.key} {first}", make, query.guard.given()):
+                command()
+
+        for first in range(0, query.rooms.pairs, size):
+            launch(kernels.take_part_kernel, first, size, [first, record, *taken])
+            operator.search()
+            operator.report()
+            launch(kernels.put_part_kernel, first, (size, query.point_max), [first, *put])
