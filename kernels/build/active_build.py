@@ -33,14 +33,7 @@ def find_extent(boxes: FaceBoxes, order: wp.array2d(dtype=wp.int32), axis: wp.in
 
 
 @wp.func
-def cost_of_axis(
-    boxes: FaceBoxes,
-    order: wp.array2d(dtype=wp.int32),
-    axis: wp.int32,
-    begin: wp.int32,
-    middle: wp.int32,
-    end: wp.int32,
-):
+def cost_of_axis(boxes: FaceBoxes, order: wp.array2d(dtype=wp.int32), axis: int, begin: int, middle: int, end: int):
     """Return the cost of a split along an axis, which is minimised."""
     if end - begin < SMALL_SEGMENT:
         return -find_extent(boxes, order, axis, begin, end)[axis]
@@ -58,8 +51,7 @@ def split_segment_kernel(
 ):
     """Split each segment of a level at its median, along the axis of the least cost, ties by axis.
 
-    Args:
-        order: Faces by the centre of their boxes along each axis, segment by segment, shape [3, face].
+    `order` has the faces by the centre of their boxes along each axis, segment by segment, shape [3, face].
     """
     i = wp.int64(wp.tid())
     n = wp.int64(order.shape[1])

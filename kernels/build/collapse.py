@@ -152,8 +152,7 @@ def weigh_faces_kernel(
 ):
     """Add every face's planes to the quadrics of its corners (serial, dim=1).
 
-    Args:
-        boundary: 1 where edge k to k+1 of the face has no other face, shape [face_count, 3].
+    `boundary` is 1 where edge k to k+1 of the face has no other face, shape [face_count, 3].
     """
     for f in range(face_count):
         corner = forest.face_corners(face_vertex, f)
@@ -188,11 +187,7 @@ def price_edges_kernel(
     surface: Surface,
     key_out: wp.array(dtype=wp.float64),
 ):
-    """Price every edge of the original mesh (serial, dim=1).
-
-    Args:
-        edge_pair: Packed edges, stage FRESH, shape [edge_count].
-    """
+    """Price every edge of the original mesh, packed, of stage FRESH (serial, dim=1)."""
     for i in range(edge_count):
         a = queue.pair_first(edge_pair[i])
         b = queue.pair_second(edge_pair[i])
@@ -201,11 +196,7 @@ def price_edges_kernel(
 
 
 @wp.kernel
-def compact_heap_kernel(
-    surface: Surface,
-    heap_inout: queue.Heap,
-    counter_inout: wp.array(dtype=int),
-):
+def compact_heap_kernel(surface: Surface, heap_inout: queue.Heap, counter_inout: wp.array(dtype=int)):
     """Drop the stale entries and order the rest as a heap (serial, dim=1)."""
     size = counter_inout[HEAP_SIZE]
     kept = int(0)

@@ -9,10 +9,10 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.build import triangle_cover as cover
+from warp_abtree.kernels.build.triangle_cover import Covers, Replay
 from warp_abtree.kernels.build.vertex_forest import absorb_ring, count_dying, third_corner, third_vertices_live
 
-wp.set_module_options(native.options("build/cover_ring.h", "build/fetch_merge.h"))
-
+wp.set_module_options(native.options("build/cover_ring.h", "build/fetch_merge.h", "build/one_polygon.h"))
 
 # Entries of `Replay.counter`, kept between launches.
 NEXT_MERGE = wp.constant(0)
@@ -26,7 +26,7 @@ SEARCH_REACH = wp.constant(wp.float64(2.0**-10))
 
 
 @wp.func
-def register_slot(replay: cover.Replay, slot: int, f: int):
+def register_slot(replay: Replay, slot: int, f: int):
     first = replay.face_slot[f]
     replay.slot[slot, cover.SLOT_FACE] = f
     replay.slot[slot, cover.SLOT_NEXT] = first
@@ -37,7 +37,7 @@ def register_slot(replay: cover.Replay, slot: int, f: int):
 
 
 @wp.func
-def release_triangle(replay: cover.Replay, t: int, face_count: int, free: int):
+def release_triangle(replay: Replay, t: int, face_count: int, free: int):
     """End every registration of triangle t; return how many pooled slots are free."""
     slot = t
     while slot >= 0:
@@ -58,7 +58,7 @@ def release_triangle(replay: cover.Replay, t: int, face_count: int, free: int):
 
 
 @wp.func
-def register_triangle(replay: cover.Replay, t: int, used: int, free: int):
+def register_triangle(replay: Replay, t: int, used: int, free: int):
     """Register triangle t with the faces in replay.scratch.used; return how many pooled slots are left."""
     register_slot(replay, t, replay.scratch.used[0])
     for k in range(1, used):
@@ -72,7 +72,7 @@ def register_triangle(replay: cover.Replay, t: int, used: int, free: int):
 
 
 @wp.func
-def search_all(replay: cover.Replay, limit: wp.float64):
+def search_all(replay: Replay, limit: wp.float64):
     """Return the active face with the least bound for the current triangle, or any within `limit`.
 
     The Bvh is of an earlier surface and proposes faces only, dead ones too; their bounds are measured.
@@ -102,7 +102,7 @@ def search_all(replay: cover.Replay, limit: wp.float64):
 
 
 @wp.func
-def component_vanishes(replay: cover.Replay, a: int, b: int):
+def component_vanishes(replay: Replay, a: int, b: int):
     """Tell whether merging a and b removes the last faces of their connected component."""
     if replay.rings.degree[a] + replay.rings.degree[b] > 2 * count_dying(replay.rings, a, b):
         return False
@@ -110,7 +110,7 @@ def component_vanishes(replay: cover.Replay, a: int, b: int):
 
 
 @wp.func
-def queue_ring(replay: cover.Replay, queued: int, node: int, stamp: int):
+def queue_ring(replay: Replay, queued: int, node: int, stamp: int):
     """Queue every triangle registered with a live face at a node; return the new count."""
     k = replay.rings.head[node]
     while k >= 0:
@@ -130,7 +130,7 @@ def queue_ring(replay: cover.Replay, queued: int, node: int, stamp: int):
 
 
 @wp.func
-def third_rings(replay: cover.Replay, a: int, b: int, stamp: int):
+def third_rings(replay: Replay, a: int, b: int, stamp: int):
     """Make the faces around the third corners of the faces that die with (a, b) candidates; return their count."""
     near_count = int(0)
     k = replay.rings.head[a]
@@ -151,16 +151,8 @@ def third_rings(replay: cover.Replay, a: int, b: int, stamp: int):
 
 
 @wp.kernel
-def start_replay_kernel(
-    face_count: int,
-    face_vertex: wp.array2d(dtype=int),
-    replay_inout: cover.Replay,
-):
-    """Register every original triangle with itself (serial, dim=1).
-
-    Args:
-        replay_inout: `face_slot` and `face_stamp` must hold -1.
-    """
+def start_replay_kernel(face_count: int, face_vertex: wp.array2d(dtype=int), replay_inout: Replay):
+    """Register every original triangle with itself (serial, dim=1); `face_slot` and `face_stamp` must hold -1."""
     live = int(0)
     for f in range(face_count):
         for k in range(3):
@@ -179,7 +171,7 @@ def start_replay_kernel(
 
 
 @wp.func(inline=False)
-def cover_queued(replay: cover.Replay, t: int, first: int, near_count: int, shared: int, limit: wp.float64):
+def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: int, limit: wp.float64):
     """Cover triangle t again, with faces around the merge and its other faces; return its squared bound."""
     for k in range(3):
         replay.scratch.polygon[k] = replay.triangle_pos[t, k]
@@ -217,7 +209,7 @@ def cover_queued(replay: cover.Replay, t: int, first: int, near_count: int, shar
 
 
 @wp.func
-def register_covers(replay: cover.Replay, covers: cover.Covers, begin: int, end: int):
+def register_covers(replay: Replay, covers: Covers, begin: int, end: int):
     """Register triangles with the faces that were found to cover them, for the first in row 0."""
     face_count = replay.face_slot.shape[0]
     free = replay.counter[FREE_SLOTS]
@@ -233,8 +225,8 @@ def register_covers(replay: cover.Replay, covers: cover.Covers, begin: int, end:
 
 @wp.func
 def cover_queue(
-    replay: cover.Replay,
-    covers: cover.Covers,
+    replay: Replay,
+    covers: Covers,
     merge: wp.vec3i,
     queued: int,
     near_count: int,
@@ -259,7 +251,7 @@ def cover_queue(
 
 
 @wp.func
-def replay_merge(replay: cover.Replay, covers: cover.Covers, a: int, b: int, c: int, limit: wp.float64):
+def replay_merge(replay: Replay, covers: Covers, a: int, b: int, c: int, limit: wp.float64):
     """Merge nodes a and b into c and cover the triangles of their faces again; return the squared bound."""
     stamp = replay.counter[STAMP] + 1
     replay.counter[STAMP] = stamp
@@ -288,8 +280,8 @@ def replay_merges_kernel(
     merge_count: int,
     cover_budget: int,
     merge_pair: wp.array2d(dtype=int),
-    replay_inout: cover.Replay,
-    covers_inout: cover.Covers,
+    replay_inout: Replay,
+    covers_inout: Covers,
     bound_sq_out: wp.array(dtype=wp.float64),
 ):
     """Apply merges until `cover_budget` triangles have been covered again (serial, dim=1).

@@ -7,10 +7,11 @@ distance of that middle is a lower bound, so the gap between both is known.
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.build import polygon
 from warp_abtree.kernels.build.triangle_cover import FLOOR
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(native.options("build/one_polygon.h"))
 
 DEPTH = wp.constant(48)  # of the subdivision, each level at most four cuts: 192 cuts in all
 ROWS = 3 * int(DEPTH) + 8  # of the stack: a polygon is replaced by at most four, one level deeper

@@ -100,12 +100,9 @@ def fetch_merge(replay: Replay, merge_pair: wp.array2d(dtype=int), merge_count: 
 @wp.func
 def place_face(replay: Replay, f: int):
     """Load an active face's corners from the forest, for candidates of one face at a time."""
-    a = replay.pos[replay.rings.corner_node[3 * f]]
-    b = replay.pos[replay.rings.corner_node[3 * f + 1]]
-    c = replay.pos[replay.rings.corner_node[3 * f + 2]]
-    replay.face_pos[f, 0] = a
-    replay.face_pos[f, 1] = b
-    replay.face_pos[f, 2] = c
+    for k in range(3):
+        replay.face_pos[f, k] = replay.pos[replay.rings.corner_node[3 * f + k]]
+    a, b, c = replay.face_pos[f, 0], replay.face_pos[f, 1], replay.face_pos[f, 2]
     replay.face_box[f, 0] = wp.min(a, wp.min(b, c))
     replay.face_box[f, 1] = wp.max(a, wp.max(b, c))
 
@@ -274,7 +271,6 @@ def cover_triangle(replay: Replay, near_count: int, shared: int, own: int, room:
         else:
             cuts += 1
             over = point_nearest_face(replay, near_count, polygon.polygon_middle(replay.scratch, count))
-            top = polygon.split_polygon(
-                replay.face_pos, replay.scratch, count, top, over, FLOOR + COVER_MARGIN * wp.sqrt(limit)
-            )
+            margin = FLOOR + COVER_MARGIN * wp.sqrt(limit)
+            top = polygon.split_polygon(replay.face_pos, replay.scratch, count, top, over, margin)
     return limit, used

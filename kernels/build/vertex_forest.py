@@ -110,15 +110,10 @@ def are_distinct(corner: wp.vec3i):
 
 
 @wp.kernel
-def link_rings_kernel(
-    face_count: int,
-    face_vertex: wp.array2d(dtype=int),
-    rings_inout: Rings,
-):
+def link_rings_kernel(face_count: int, face_vertex: wp.array2d(dtype=int), rings_inout: Rings):
     """Link the corners of every face with three distinct corners; mark the others dead (serial, dim=1).
 
-    Args:
-        rings_inout: `head` must hold -1 and `degree` 0. Rings come out in ascending order of corners.
+    `head` must hold -1 and `degree` 0. Rings come out in ascending order of corners.
     """
     f = face_count - 1
     while f >= 0:
@@ -137,10 +132,7 @@ def link_rings_kernel(
 @wp.func
 def next_merge(node: int, node_count: int, vertex_parent: wp.array(dtype=int)):
     """Return the parent of a node, or node_count at a root, so that roots come last."""
-    p = vertex_parent[node]
-    if p < 0:
-        p = node_count
-    return p
+    return wp.where(vertex_parent[node] < 0, node_count, vertex_parent[node])
 
 
 @wp.func

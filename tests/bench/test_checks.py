@@ -9,7 +9,7 @@ from bench.meshes import knot_model
 from bench.shapes import pair_poses, random_poses, scene_of_objects, scene_of_pairs
 from bench.verify import count_differences
 from warp_abtree import testing
-from warp_abtree.state import lod_update, work_lists
+from warp_abtree.state import work_lists
 
 pytestmark = pytest.mark.slow
 
@@ -93,7 +93,7 @@ def run_forgetting(device, monkeypatch, model):
     move = scene, [model.lod_max - 5], [model.lod_max], model.face_count
     k, *_, launches = update.check_update(*move)
     assert k[0] > 0 and set(launches) == {"update", "full"}
-    whole = lod_update.active_update
+    whole = work_lists.active_update
 
     def forget(models, states, work):
         if work.full.all():
@@ -104,6 +104,6 @@ def run_forgetting(device, monkeypatch, model):
         work.plan.level_count.assign(counts)
         work_lists.active_walk(models, states, work)
 
-    monkeypatch.setattr(lod_update, "active_update", forget)
+    monkeypatch.setattr(work_lists, "active_update", forget)
     with pytest.raises(RuntimeError, match="bits"):
         update.check_update(*move)

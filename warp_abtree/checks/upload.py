@@ -5,11 +5,17 @@ import warp as wp
 
 
 def struct_of(struct, device, **values):
-    """Return a struct with arrays on a device of the types that its fields have; those that are not given are empty."""
+    """Return a struct with arrays on a device of the types that its fields have; those that are not given are empty.
+
+    Args:
+        values: Rows of an array, an array of the device, or the value of a field that is none, by the fields' names.
+    """
     made = struct()
-    for name, rows in values.items():
-        dtype = struct.vars[name].type.dtype
-        setattr(made, name, wp.array(np.ascontiguousarray(rows), dtype=dtype, device=device))
+    for name, value in values.items():
+        kind = struct.vars[name].type
+        if isinstance(kind, wp.array) and not isinstance(value, wp.array):
+            value = wp.array(np.ascontiguousarray(value), dtype=kind.dtype, device=device)
+        setattr(made, name, value)
     return made
 
 

@@ -19,7 +19,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import finite_array, positive, whole_number
 from warp_abtree.checks.device_memory import DeviceMemory
-from warp_abtree.checks.upload import Download, Upload
+from warp_abtree.checks.upload import Download, Upload, struct_of
 from warp_abtree.kernels.lod import paper, prediction, tolerance
 from warp_abtree.kernels.lod.ladder import WARP
 from warp_abtree.lod.selection import lod_pool
@@ -91,31 +91,21 @@ class Controller(DeviceMemory):
     def next_lods(self, feedback: Feedback) -> wp.array:
         """Return the LOD of every object for the coming frame, int32 (n,) on the device, overwritten by the next call.
 
-        Args:
-            feedback: Of the last frame; at first, a `Feedback` with a time alone.
-
-        Raises:
-            RuntimeError: The scene's objects changed since the controller was made.
+        `feedback` is of the last frame; at first, a `Feedback` with a time alone. Raises RuntimeError where the scene's
+        objects changed since the controller was made.
         """
         self.prepare(feedback)
         self.launch()
         return self.lods
 
     def rests(self, feedback: Feedback) -> bool:
-        """Return whether a selection is known to leave all LODs as the last one did, which may be left out then.
-
-        Waits for the device.
-        """
+        """Return whether a selection would leave all LODs as they are, and may be left out. Waits for the device."""
         return False
 
     def prepare(self, feedback: Feedback, rests: bool = False):
         """Bring to the device what `launch` reads of the feedback and the camera; a captured graph reads it too.
 
-        Args:
-            rests: Whether the selection is left out.
-
-        Raises:
-            RuntimeError: As `next_lods`.
+        `rests` tells whether the selection is left out. Raises RuntimeError as `next_lods`.
         """
         self.view.check()
         if self._ahead != feedback.time:
@@ -131,11 +121,7 @@ class Controller(DeviceMemory):
         self._ahead = time
 
     def launch(self, rests: bool = False):
-        """Measure the view as the camera and the objects stand, and select the LODs of a frame. Launches only.
-
-        Args:
-            rests: Whether the selection is left out.
-        """
+        """Measure the view as the camera and the objects stand, and select LODs unless it rests. Launches only."""
         if self.camera is not None:
             self.view.launch()
         if not rests:
@@ -291,7 +277,10 @@ class PredictiveController(Controller):
         self.changes = [*CLIMBS, 0, *falls, -self.position_max, 0]
         self._rates = Upload(5, self.device)
         self._rates.send([math.nan] * 5)
-        self.prediction = self._make_prediction()
+        powers = dict.fromkeys(("power_up", "power_down"), np.zeros(self.ladder.lod.size))
+        sums = dict.fromkeys(("work", "nodes"), np.zeros(len(self.changes)))
+        given = {"change": self.changes, "rate": self._rates.array, "ended": [0]}
+        self.prediction = struct_of(prediction.Prediction, self.device, **given, **powers, **sums)
         self.rate, count = self.prediction.rate, len(self.lods)
         self.tests, self.choice = self._zeros(count, wp.int64), self._zeros(6)
         self._told = Download(6, wp.float64, self.device)  # the choice, for the host
@@ -300,16 +289,6 @@ class PredictiveController(Controller):
         self.chosen = self._make_chosen()
         self._query, self._refine, self._rest = CostFit(), CostFit(), CostFit()
         self._exponent, self._drift = 1.0, 0.0
-
-    def _make_prediction(self):
-        candidates, levels = len(self.changes), self.ladder.lod.size
-        made = prediction.Prediction()
-        made.change = wp.array(np.array(self.changes, np.int32), dtype=wp.int32, device=self.device)
-        made.rate = self._rates.array
-        made.power_up, made.power_down = self._zeros(levels), self._zeros(levels)
-        made.work, made.nodes = self._zeros(candidates, wp.int64), self._zeros(candidates, wp.int64)
-        made.ended = self._zeros(1, wp.int32)
-        return made
 
     def _make_chosen(self):
         made = prediction.LevelChoice()

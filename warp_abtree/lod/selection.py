@@ -26,7 +26,7 @@ def lod_pool(ladder: Ladder, scene) -> LodPool:
     levels = np.stack([(error > tolerances[:, None]).sum(1) for error in ladder.error])
     levels[:, 0] = 0
     shared = shares_levels(scene.object_model, ladder.levels())
-    pool = struct_of(
+    return struct_of(
         LodPool,
         scene.device,
         object_model=scene.object_model,
@@ -38,6 +38,6 @@ def lod_pool(ladder: Ladder, scene) -> LodPool:
         face_count=[model.face_count for model in ladder.models],
         refits=~shared,
         tolerance_level=levels.ravel(),
+        level_count=ladder.steps + 1,
+        tolerance_count=len(tolerances),
     )
-    pool.level_count, pool.tolerance_count = ladder.steps + 1, len(tolerances)
-    return pool

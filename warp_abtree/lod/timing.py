@@ -69,9 +69,7 @@ class Timer:
     On CUDA and without a clock of its own it records events, which a graph may do too: what it marks there while a
     graph is captured, a replay marks again.
 
-    Args:
-        device: Where the work runs.
-        clock: Seconds, read when a frame begins and at every mark; None is the host's clock, on CUDA events.
+    `clock` returns seconds, read when a frame begins and at every mark; None is the host's clock, on CUDA events.
 
     Attributes:
         counts_work: Whether the clock takes the counted work of each stage.

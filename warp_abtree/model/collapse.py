@@ -8,10 +8,12 @@ import threading
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.build import collapse
 from warp_abtree.kernels.build.heap import Heap
 from warp_abtree.kernels.build.quadric import Quadric
 from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, unwritten
+from warp_abtree.model.files.polygons import distinct_corners
 
 # Merges per launch.
 MERGES = 25_000
@@ -51,9 +53,10 @@ class Collapse:
         surface.pos = wp.array(self.pos, dtype=wp.vec3d, device="cpu", copy=False)
         surface.quadric = wp.zeros(nodes, dtype=Quadric, device="cpu")
         surface.parent, surface.stamp = filled(nodes, -1), filled(nodes, -1)
-        self._rings = linked_rings(faces, face_array, nodes)
+        self._rings = linked_rings(face_array, nodes)
         launch(collapse.weigh_faces_kernel, len(faces), face_array, cpu_array(boundary, wp.int8), surface)
-        self._heap = _new_heap(np.resize(edges, HEAP_PER_EDGE * len(edges) + HEAP_EXTRA))
+        pairs = np.resize(edges, HEAP_PER_EDGE * len(edges) + HEAP_EXTRA)
+        self._heap = struct_of(Heap, "cpu", pair=pairs, key=np.zeros(len(pairs)))
         launch(collapse.price_edges_kernel, len(edges), self._heap.pair, surface, self._heap.key)
         self._counter = cpu_array([len(edges), 0, self._start_live, collapse.RUNNING], int)
         launch(collapse.compact_heap_kernel, surface, self._heap, self._counter)
@@ -110,23 +113,9 @@ class Collapse:
         heap, before = self._heap, int(self._state[0])
         launch(collapse.compact_heap_kernel, self._surface, heap, self._counter)
         size, capacity = int(self._state[0]), len(heap.key)
-        if 4 * size <= 3 * capacity < 4 * before:
-            return
-        self._heap = _new_heap(np.zeros(capacity + capacity // 2 + 64, np.int64))
-        wp.copy(self._heap.key, heap.key, count=size)
-        wp.copy(self._heap.pair, heap.pair, count=size)
-
-
-def _new_heap(pairs):
-    heap = Heap()
-    heap.pair = cpu_array(pairs, wp.int64)
-    heap.key = wp.zeros(len(pairs), dtype=wp.float64, device="cpu")
-    return heap
-
-
-def distinct_corners(faces):
-    """Return which faces have three distinct corners."""
-    return (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+        if not 4 * size <= 3 * capacity < 4 * before:
+            pair, key = (np.resize(array.numpy(), capacity + capacity // 2 + 64) for array in (heap.pair, heap.key))
+            self._heap = struct_of(Heap, "cpu", pair=pair, key=key)
 
 
 def _edges(faces):

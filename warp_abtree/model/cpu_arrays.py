@@ -35,14 +35,12 @@ def find_frame(vertices):
     return lower / 2 + upper / 2, float(np.ldexp(1.0, int(np.clip(exponent, -1000, 1000))))
 
 
-def linked_rings(faces, face_array, node_capacity):
-    """Return `vertex_forest.Rings` of the original mesh with room for `node_capacity` nodes."""
+def linked_rings(faces, node_capacity):
+    """Return `vertex_forest.Rings` of the original mesh, its faces on the CPU, with room for so many nodes."""
     rings = vertex_forest.Rings()
-    rings.head = filled(node_capacity, -1)
-    rings.degree = filled(node_capacity, 0)
-    rings.next = filled(3 * len(faces), -1)
-    rings.corner_node = filled(3 * len(faces), -1)
-    launch(vertex_forest.link_rings_kernel, len(faces), face_array, rings)
+    rings.head, rings.degree = filled(node_capacity, -1), filled(node_capacity, 0)
+    rings.next, rings.corner_node = filled(3 * len(faces), -1), filled(3 * len(faces), -1)
+    launch(vertex_forest.link_rings_kernel, len(faces), faces, rings)
     return rings
 
 
@@ -51,5 +49,5 @@ def make_scratch(candidates, faces, rows):
     scratch, corners = polygon.Scratch(), int(polygon.POLYGON_CORNERS)
     scratch.near, scratch.used = unwritten(candidates), unwritten(faces)
     scratch.stack, scratch.stack_count = unwritten((rows, corners), wp.vec3d), unwritten(rows)
-    scratch.polygon, scratch.clipped = unwritten((corners,), wp.vec3d), unwritten((corners,), wp.vec3d)
+    scratch.polygon = unwritten((corners,), wp.vec3d)
     return scratch

@@ -44,8 +44,7 @@ class LodBounds:
     """Bounds on the distance of any point of the original surface from the surface after each merge.
 
     Attributes:
-        done: Merges that are bounded.
-        replay: The surface after them, and which faces cover which original triangles.
+        replay: The surface after those that are bounded, and which faces cover which original triangles.
     """
 
     def __init__(self, vertices, faces):
@@ -57,7 +56,7 @@ class LodBounds:
         self._pos = np.zeros((2 * len(vertices), 3))
         self._pos[: len(vertices)] = (vertices - self._centre) / self._scale
         self.replay = _new_replay(self._pos, face_count)
-        self.replay.rings = linked_rings(faces, face_array, 2 * len(vertices))
+        self.replay.rings = linked_rings(face_array, 2 * len(vertices))
         launch(hausdorff_bound.start_replay_kernel, face_count, face_array, self.replay)
         self._covers, rows = triangle_cover.Covers(), triangle_cover.COVERS_AT_ONCE
         self._covers.triangle, self._covers.first = self.replay.queue, self.replay.queue_face
@@ -158,11 +157,9 @@ class OutwardError:
         distance_sq = wp.zeros(len(point), dtype=wp.float64, device="cpu")
         inputs = [cpu_array(point, wp.vec3d), cpu_array(guess, int), original, distance_sq]
         wp.launch(outward_bound.measure_points_kernel, dim=len(point), inputs=inputs, device="cpu")
-        bound_sq = wp.zeros(len(corner), dtype=wp.float64, device="cpu")
+        bound_sq, rows = wp.zeros(len(corner), dtype=wp.float64, device="cpu"), outward_bound.ROWS
         inputs = [float(distance_sq.numpy().max()), cpu_array(corner, wp.vec3d), cpu_array(face_ids, int), original]
-        rows = outward_bound.ROWS
-        inputs += [make_scratch(1, 1, rows), wp.zeros(rows, dtype=int, device="cpu"), bound_sq]
-        wp.launch(outward_bound.bound_faces_kernel, dim=1, inputs=inputs, device="cpu")
+        launch(outward_bound.bound_faces_kernel, *inputs, make_scratch(1, 1, rows), filled(rows, 0), bound_sq)
         # ROUNDING is of coordinates up to 1/2; merged vertices may lie outside the box of the original ones.
         reach = max(1.0, 2 * float(np.abs(point).max()))
         return float(scale * (np.sqrt(bound_sq.numpy().max()) + ROUNDING * reach))

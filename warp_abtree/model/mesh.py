@@ -12,6 +12,7 @@ import numpy as np
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.kernels.base.poses import COORDINATE_MIN
 from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
+from warp_abtree.model.files.polygons import distinct_corners
 from warp_abtree.model.files.read import read_file, split_file_name
 from warp_abtree.model.files.usd_mesh import read_warp_asset
 from warp_abtree.model.winding import component_labels, find_winding, keep_outside
@@ -141,9 +142,6 @@ def orient_mesh(mesh):
     return replace(mesh, faces=faces)
 
 
-# Validation and welding.
-
-
 def _join_geometry(geometry, name, where=None, remarks=""):
     """Join the triangles of a trimesh object; points and paths are ignored."""
     import trimesh
@@ -195,8 +193,7 @@ def _weld_mesh(vertices, faces, name, where):
     if len(positions) > FACE_LIMIT:
         raise MeshError(f"{where}: {len(positions)} vertices, but at most 2^30 are possible")
 
-    a, b, c = faces.T
-    dropped = np.flatnonzero((a == b) | (b == c) | (c == a)).astype(np.int32)
+    dropped = np.flatnonzero(~distinct_corners(faces)).astype(np.int32)
     if len(dropped) == len(faces):
         raise MeshError(f"{where}: no face has three distinct corners (coincident vertices are one)")
     with np.errstate(over="ignore"):
@@ -234,11 +231,16 @@ def _as_array(values, what, where):
 def _checked_vertices(vertices, where):
     with np.errstate(over="ignore"):
         vertices = _as_array(vertices, "vertices", where).astype(np.float64)
-    finite = np.isfinite(vertices).all(axis=1)
-    if not finite.all():
-        index = int(np.argmin(finite))
+    index = _first_wrong(np.isfinite(vertices))
+    if index is not None:
         raise MeshError(f"{where}: vertex {index} is not finite: {vertices[index].tolist()}")
     return vertices
+
+
+def _first_wrong(rows) -> int | None:
+    """Return the index of the first row in which something does not hold, None if all do."""
+    wrong = np.flatnonzero(~rows.all(axis=1))
+    return int(wrong[0]) if len(wrong) else None
 
 
 def _checked_faces(faces, vertex_count, where):
@@ -247,13 +249,11 @@ def _checked_faces(faces, vertex_count, where):
         raise MeshError(f"{where}: {len(faces)} faces, but at most 2^30 are possible")
     if faces.dtype.kind == "f":
         with np.errstate(invalid="ignore"):
-            integral = (np.floor(faces) == faces).all(axis=1)
-        if not integral.all():
-            index = int(np.argmin(integral))
+            index = _first_wrong(np.floor(faces) == faces)
+        if index is not None:
             raise MeshError(f"{where}: face {index} has corners that are not integers: {faces[index].tolist()}")
-    inside = ((faces >= 0) & (faces < vertex_count)).all(axis=1)
-    if not inside.all():
-        index = int(np.argmin(inside))
+    index = _first_wrong((faces >= 0) & (faces < vertex_count))
+    if index is not None:
         raise MeshError(
             f"{where}: face {index} has corners {[int(x) for x in faces[index] if np.isfinite(x)]}, "
             f"but vertices run from 0 to {vertex_count - 1}"
@@ -271,9 +271,6 @@ def _weld(positions):
     representative[order] = order[starts][np.cumsum(starts) - 1]
     is_first = representative == np.arange(len(order))
     return np.flatnonzero(is_first), (np.cumsum(is_first) - 1)[representative]
-
-
-# Description.
 
 
 def _zero_area(vertices, faces):

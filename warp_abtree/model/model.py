@@ -235,7 +235,7 @@ def _build(mesh, base_faces, progress, key, certify) -> Model:
 def _read(path, more=(), error_key=None) -> Model:
     """Read a model file with more arrays, and check all of it, as `Model.open`; the cache may have its errors."""
     names = (*_ARRAYS, *more, "leaf_node", "name")
-    if path.is_dir() or (path.exists() and not path.is_file()):
+    if path.exists() and not path.is_file():
         raise ModelError(f"{path}: is no regular file")
     try:
         with path.open("rb") as raw:
@@ -324,12 +324,10 @@ def _assemble(path, arrays, error_key) -> Model:
         dtype, ndim = (_ARRAYS | _ERROR)[key]
         integral = value.dtype.kind == "i" if dtype is None else value.dtype == dtype
         require(integral and value.ndim == ndim, f"array {key!r} has type {value.dtype} and shape {value.shape}")
-    parent, pos = arrays["vertex_parent"], arrays["vertex_pos"]
-    faces, split = arrays["face_vertex"], arrays["face_split"]
-    start, error = arrays["split_start"], arrays.pop("lod_error", None)
+    error = arrays.pop("lod_error", None)
+    parent, pos, faces, split, start, slices = (arrays[key] for key in _ARRAYS)
     m = len(start) - 1
-    n_v = len(parent) - m
-    n_f = len(faces)
+    n_v, n_f = len(parent) - m, len(faces)
     require(m >= 0 and n_v > 0 and n_f > 0, "empty arrays")
     require(pos.shape == (n_v + m, 3) and np.isfinite(pos).all(), "'vertex_pos' has the wrong length or is not finite")
     size = np.abs(pos)
@@ -340,7 +338,6 @@ def _assemble(path, arrays, error_key) -> Model:
     above = (parent > nodes) & (parent >= n_v) & (parent < n_v + m)
     require(((parent == -1) | above).all(), "'vertex_parent' is no forest")
     require(split.shape == (n_f,) and split.min() >= 0 and split.max() <= m + 1, "'face_split' is out of range")
-    slices = arrays["split_face"]
     rises = len(start) == m + 1 and start[0] == 0 and (np.diff(start) >= 0).all()
     require(rises and start[-1] == len(slices), "'split_start' does not fit 'split_face'")
     require(len(slices) == 0 or (slices.min() >= 0 and slices.max() < n_f), "'split_face' is out of range")

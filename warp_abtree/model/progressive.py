@@ -88,7 +88,7 @@ class ProgressiveMesh:
         lods = np.asarray(lod)
         if not np.issubdtype(lods.dtype, np.integer):
             raise ValueError(f"lod must be an integer, got {lod!r}")
-        if np.any(lods < 0) or np.any(lods > self.lod_max):
+        if np.any((lods < 0) | (lods > self.lod_max)):
             raise ValueError(f"lod must lie in 0..{self.lod_max}, got {lod}")
         counts = self._active_counts[lods]
         return int(counts) if lods.ndim == 0 else counts

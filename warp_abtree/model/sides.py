@@ -14,14 +14,11 @@ NEAR_FRACTION, NEAR_ROUNDING = 1e-9, 2.0**-48
 
 
 def loose_inside_out(vertices, faces, part, loose, counted, borders):
-    """Return the rows of each part that is inside out of some which are closed by others alone.
+    """Return the rows of each part that is inside out of some, `loose`, which are closed by others alone.
 
-    Parity at the middle of a face decides, of one that is not on another surface. Of two flat parts on one another, the
-    walls of bodies that touch, one is turned where both run along their border the same way.
-
-    Args:
-        counted: Rows of the faces that parity counts.
-        borders: Edges of each part that leave it open, and how it runs along them, as bytes.
+    Parity, which counts the rows `counted`, at the middle of a face decides, of one that is not on another surface. Of
+    two flat parts on one another, the walls of bodies that touch, one is turned where both run along their border the
+    same way: `borders` has the edges that leave each part open, and how it runs along them, as bytes.
     """
     corners = vertices[faces]
     order = np.argsort(part, kind="stable")
@@ -29,8 +26,7 @@ def loose_inside_out(vertices, faces, part, loose, counted, borders):
     windows = [_Window(corners[counted], counted, axis) for axis in range(3)]
     alike: dict[tuple, list] = {}
     for k, at, to in zip(loose.tolist(), start, end):
-        rows = order[at:to]
-        edges, way = borders[k]
+        (edges, way), rows = borders[k], order[at:to]
         alike.setdefault((edges, np.unique(faces[rows]).tobytes()), []).append((way, rows))
     turned = []
     for parts in alike.values():
@@ -64,9 +60,8 @@ class _Window:
 
     def over(self, point, axes, face):
         """Return the faces but one whose boxes hold a point as seen along the last of some axes; the first is ours."""
-        start, end = np.searchsorted(
-            self._start, point[axes[0]] + np.array([-self._reach - 2 * self.near, 2 * self.near])
-        )
+        ends = point[axes[0]] + np.array([-self._reach - 2 * self.near, 2 * self.near])
+        start, end = np.searchsorted(self._start, ends)
         lower, upper = self._lower[start:end, axes[:2]], self._upper[start:end, axes[:2]]
         held = (lower <= point[axes[:2]] + self.near).all(1) & (upper >= point[axes[:2]] - self.near).all(1)
         found = self.faces[start:end][held]

@@ -81,10 +81,9 @@ class Winding:
         """Return what is wrong with the winding in a few words, or None."""
         if self.mixed_edges:
             return f"neighbouring faces disagree about the outside at {self.mixed_edges} edges"
-        inverted = len(self.inside_out)
-        if not inverted:
-            return None
-        return "it is inside out" if inverted == len(self.faces) else f"parts of it are inside out, {inverted} faces"
+        count = len(self.inside_out)
+        some = "it is inside out" if count == len(self.faces) else f"parts of it are inside out, {count} faces"
+        return some if count else None
 
     def describe_open(self) -> str:
         """Return how many edges are odd, and where some of them lie."""

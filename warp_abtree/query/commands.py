@@ -20,11 +20,9 @@ class Commands:
         self._times, self._graph = 0, None
 
     def find(self, name, given: tuple, make) -> list:
-        """Return the launches of a name, recorded anew where what they were given has changed.
+        """Return the launches of a name, recorded anew where what they were given has changed: generations, numbers.
 
-        Args:
-            given: What the launches depend on: generations of the arrays, and numbers.
-            make: Returns a list of launches, in their order, made by a function that takes what `wp.launch` does.
+        `make` returns a list of launches, in their order, made by a function that takes what `wp.launch` does.
         """
         before, commands = self._made.get(name, (None, []))
         if before != given:
@@ -42,9 +40,7 @@ class Commands:
     def repeat_call(self, given: tuple, device, launch):
         """Launch a whole call, by a graph on a GPU once it has come a few times alike.
 
-        Args:
-            given: What the launches depend on, as for `find`, and addresses that `find` need not know.
-            launch: Makes the launches, and nothing but launches.
+        `given` is as for `find`, with addresses that `find` need not know; `launch` only launches.
         """
         if given != self._call:
             self._call, self._times, self._graph = given, 0, None

@@ -136,24 +136,16 @@ class Operator(DeviceMemory):
         """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
         return self.regime.uses_warps(self.device)
 
-    def _asked_arrays(self, rooms: Rooms) -> list[Array]:
-        own = [Array(self.pair_batch, "poses", PairPose, rooms.pairs)]
-        if self.broad_phase is None:
-            own.append(Array(self.pair_batch, "pairs", wp.vec2i, rooms.pairs))
-        for stage in self.stages:
-            own += stage.arrays(rooms)
-        return own
-
     def _make(self, rooms: Rooms) -> list:
         """Return (owner, attribute, new array) of all that other rooms take, before anything is replaced."""
         check_pair_room(rooms.pairs)
         for stage in self.stages:
             stage.prepare(rooms)
-        made = [
-            (asked.owner, asked.name, asked.make(self.device))
-            for asked in self._asked_arrays(rooms)
-            if not asked.is_in_place()
-        ]
+        asked = [Array(self.pair_batch, "poses", PairPose, rooms.pairs)]
+        if self.broad_phase is None:
+            asked.append(Array(self.pair_batch, "pairs", wp.vec2i, rooms.pairs))
+        asked += [array for stage in self.stages for array in stage.arrays(rooms)]
+        made = [(array.owner, array.name, array.make(self.device)) for array in asked if not array.is_in_place()]
         if self.broad_phase is not None and rooms.pairs != len(self.broad_phase.pairs):
             found = self.broad_phase.make_arrays(rooms.pairs)
             pairs = next(array for _, name, array in found if name == "pairs")
@@ -163,8 +155,7 @@ class Operator(DeviceMemory):
     def make_room(self, pairs: int | None = None, hits: int | None = None, uncertain: int | None = None):
         """Make room for other numbers of entries, None for those of before: for all, or nothing changes.
 
-        Raises:
-            CapacityError: More than there can be room for.
+        Raises CapacityError for more than there can be room for.
         """
         asked = zip((pairs, hits, uncertain), self.rooms, strict=True)
         rooms = Rooms(*(now if wanted is None else wanted for wanted, now in asked))
@@ -192,7 +183,8 @@ class Operator(DeviceMemory):
             if has_other_pairs:
                 if self.broad_phase is None:
                     self.readout.write_pairs(self.given)
-                self._fill_distances()
+                for distance in self._distances.values():
+                    distance.fill()
 
     @contextmanager
     def changing(self):
@@ -206,21 +198,20 @@ class Operator(DeviceMemory):
         if self._torn:
             raise RuntimeError("this query was interrupted while its buffers changed; make a new one")
 
-    def _fill_distances(self):
-        for distance in self._distances.values():
-            distance.fill()
-
     def distances_of(self, name: str) -> wp.array:
         """Return the distances of pairs of a name, such as "within", device float64 (pair capacity,)."""
         return self._distances[name].rows
 
-    def ask_pairs(self, pairs, **distances):
-        """Query other pairs from now on, in the room there is if they fit; distances of None stay.
+    def set_pairs(self, pairs, within=None):
+        """Query other pairs from now on, in the room there is if they fit; within None keeps the distances.
 
         Raises:
-            ValueError: Bad pairs or distances, an operator that runs the broad phase, or distances for one made
-                without.
+            ValueError: Bad pairs or distances, a query that runs the broad phase, or distances for one made without.
         """
+        self.ask_pairs(pairs, within=within)
+
+    def ask_pairs(self, pairs, **distances):
+        """Do what `set_pairs` does, with distances by their names; those of None stay."""
         if self.broad_phase is not None:
             raise ValueError("this query takes its pairs from the broad phase")
         check_device(self.device, "giving a query other pairs")
@@ -246,7 +237,8 @@ class Operator(DeviceMemory):
             self.given = pairs
             for name, value in distances.items():
                 self._distances[name].value = value
-            self._fill_distances()
+            for distance in self._distances.values():
+                distance.fill()
 
     def is_asked(self, pairs: np.ndarray, **distances) -> bool:
         """Return whether pairs and distances, checked, None without, are those in place."""
@@ -257,10 +249,7 @@ class Operator(DeviceMemory):
         return same
 
     def launch(self, between=None):
-        """Run broad phase (unless pairs were given) and narrow phase. Launches only.
-
-        Args:
-            between: Called between the two, as to time them.
+        """Run broad phase (unless pairs were given), `between`, as to time them, and narrow phase. Launches only.
 
         Raises:
             RuntimeError: The scene's objects changed since the query was made, or its filter where the broad phase
@@ -333,10 +322,7 @@ class Operator(DeviceMemory):
         self.launch_kernel(kernel, count * self.lanes, inputs, WARP_SIZE)
 
     def result(self, device: bool = False) -> Result:
-        """Return the results of the last launch, sorted. Waits for the device.
-
-        Args:
-            device: Whether the arrays stay on the device, as Warp arrays that no later launch changes.
+        """Return the results of the last launch, sorted; on the device, as arrays that no later launch changes. Waits.
 
         Raises:
             RuntimeError: There are none: nothing was launched, a launch was interrupted, or it was the replay of a
@@ -359,10 +345,7 @@ class Operator(DeviceMemory):
             CapacityError: More pairs or hits than there can be room for.
             RuntimeError: As `launch`; or a graph is being captured.
         """
-        self._grow(self._read_demand, between)
-
-    def _read_demand(self) -> Found:
-        return Found(self.readout.read_totals())
+        self._grow(self.readout.read_demand, between)
 
     def _grow(self, read, between=None, first=None) -> Found:
         """Launch as `grow` and return what `read` finds of the last launch; `first` does both the first time."""
@@ -386,8 +369,8 @@ class Operator(DeviceMemory):
 
     def grow_uncertain(self):
         """Make room for the face pairs that wait, as far as there can be, and launch again until all find it."""
-        first = self._read_demand()
-        if self._grow_uncertain(self._read_demand, first) is not first:
+        first = self.readout.read_demand()
+        if self._grow_uncertain(self.readout.read_demand, first) is not first:
             self.report()
 
     def _grow_uncertain(self, read, found: Found) -> Found:

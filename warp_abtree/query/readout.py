@@ -20,6 +20,7 @@ from warp_abtree.query.staging import Staging, first_rows, view_memory
 # Rows that are expected come in steps.
 ROWS_STEP = 1024
 FLOAT64_ROW = 1 + COUNTERS.index("float64_tests")
+COLUMN_NAMES = "count", *COUNTERS
 HEADER, COLUMNS = int(kernels.HEADER_WORDS), int(kernels.COUNT_COLUMNS)
 
 
@@ -64,7 +65,6 @@ class Readout:
     def __init__(self, operator: Any):
         self.operator, self.device = proxy(operator), operator.device
         self.packs = operator.regime.packs(self.device)
-        self._views: HostViews | None = None
         self._last_read = 0, 0  # pairs of the last result, and its hits
 
     @cached_property
@@ -77,16 +77,14 @@ class Readout:
         """Return what sorts the hits of a result on the device."""
         return HitSort(self.operator)
 
-    def link(self):
-        """Take note of new arrays."""
-        self._views = None
-
-    @property
+    @cached_property
     def views(self) -> HostViews:
         """Return views of the arrays on the CPU."""
-        if self._views is None:
-            self._views = HostViews(self.operator)
-        return self._views
+        return HostViews(self.operator)
+
+    def link(self):
+        """Take note of new arrays."""
+        vars(self).pop("views", None)
 
     def write_pairs(self, pairs: np.ndarray):
         """Bring given pairs to the operator, which has room for them."""
@@ -109,11 +107,7 @@ class Readout:
             return self.make_result(self.read_pairs(device), device, with_rows)
 
     def make_result(self, found: Any, device: bool, with_rows: bool = True) -> Result:
-        """Check that there was a launch, and read what the stages have found.
-
-        Raises:
-            RuntimeError: As `Operator.result`.
-        """
+        """Check that there was a launch, as `Operator.result` does, and read what the stages have found."""
         operator = self.operator
         if operator.rooms.pairs:  # without room for pairs there are no launches
             operator.guard.check(found.totals.launched)
@@ -129,31 +123,26 @@ class Readout:
         views, hits = self.views, operator.hits
         apart, witnesses = self._read_count(hits.apart_total), self._read_count(hits.witness_total)
         lists = int(views.counts[0].sum()), int(views.counts[FLOAT64_ROW].sum()), apart, witnesses
-        return Totals(operator.guard.outcome(), self._pair_count(int(views.pair_count[0])), *self._demands(*lists))
+        return self._totals([operator.guard.outcome(), int(views.pair_count[0]), *lists])
+
+    def read_demand(self) -> Found:
+        """Read `read_totals` alone of what was found. Waits for the device."""
+        return Found(totals=self.read_totals())
 
     @staticmethod
     def _read_count(count) -> int:
         """Return a counter, read as uint32; 0 where there is none. Waits for the device."""
         return 0 if count is None else int(count.numpy().view(np.uint32)[0])
 
-    def _pair_count(self, found: int) -> int:
-        """Return how many pairs there are, of which so many were read on the device."""
-        operator = self.operator
-        return len(operator.given) if operator.broad_phase is None else operator.broad_phase.check_found(found)
-
-    def _totals(self, words) -> Totals:
+    def _totals(self, header) -> Totals:
         """Return the demands in a header; those of lists that the operator lacks are 0."""
-        launched, found, *lists = words[:HEADER].tolist()
-        return Totals(launched, self._pair_count(found), *self._demands(*lists))
-
-    def _demands(self, total: int, uncertain: int, apart: int, witnesses: int) -> tuple[int, int]:
-        """Return the room that the lists of hits, and of face pairs that wait, need; 0 for one that there is not."""
+        launched, found, total, uncertain, apart, witnesses = map(int, header[:HEADER])
         operator, hits = self.operator, self.operator.hits
         if operator.parts is not None:  # the lists have held those of one part at a time
             total, uncertain = self._read_count(hits.total), self._read_count(hits.uncertain_total)
-        listed, waits = operator.output == "faces", operator.list_rooms.uncertain
-        demand = waiting_demand(operator, apart, uncertain) if waits else 0
-        return max(total, witnesses) if listed else 0, demand
+        pairs = len(operator.given) if operator.broad_phase is None else operator.broad_phase.check_found(found)
+        demand = waiting_demand(operator, apart, uncertain) if operator.list_rooms.uncertain else 0
+        return Totals(launched, pairs, max(total, witnesses) if operator.output == "faces" else 0, demand)
 
     def read_pairs(self, device: bool) -> Found:
         """Read demands, and what there is an entry a pair of. Waits for the device."""
@@ -185,10 +174,7 @@ class Readout:
         return self._bring(n, self._sort_expected(n))
 
     def _sort_expected(self, n: int) -> int:
-        """Sort as many hits as the last result of so many pairs makes likely, and return how many.
-
-        So the device sorts them while the host still launches, and a loop over poses waits once a call.
-        """
+        """Sort as many hits as are likely after the last result, while the host still launches; return how many."""
         pairs, hits = self._last_read
         if not self.operator.lists_hits or pairs != n or hits == 0:
             return 0
@@ -211,7 +197,7 @@ class Readout:
             pairs, end = words[end : end + n].view(np.int32).reshape(n, 2), end + n
         flags = words[end:].view(bool)
         apart = None if operator.near is None else flags[n : 2 * n]
-        found = Found(self._totals(words), pairs, flags[:n], apart, columns[0], dict(zip(COUNTERS, columns[1:])))
+        found = Found(pairs, flags[:n], apart, **dict(zip(COLUMN_NAMES, columns)), totals=self._totals(words))
         self._last_read = n, found.totals.hits
         if rows is not None and found.totals.hits <= len(rows):
             found.faces = rows[: found.totals.hits]
@@ -223,8 +209,8 @@ class Readout:
         n = min(totals.pairs, operator.rooms.pairs)
         pairs = (operator.given if operator.broad_phase is None else views.pairs[:n]).copy()
         apart = None if views.near_hit is None else views.near_hit[:n] == 0
-        count, *tests = views.counts[:, :n].copy()
-        return Found(totals, pairs, views.any_hit[:n] != 0, apart, count, dict(zip(COUNTERS, tests)))
+        columns = views.counts[:, :n].copy()
+        return Found(pairs, views.any_hit[:n] != 0, apart, **dict(zip(COLUMN_NAMES, columns)), totals=totals)
 
     def _keep_pairs(self, n: int) -> Found:
         """Return arrays on the device, parts of a block of their own."""
@@ -242,7 +228,7 @@ class Readout:
         else:
             pairs, flags = part(flags, wp.vec2i), flags + column
         apart = None if operator.near is None else part(flags + n, wp.bool)
-        return Found(totals, pairs, part(flags, wp.bool), apart, words[0], dict(zip(COUNTERS, words[1:])))
+        return Found(pairs, part(flags, wp.bool), apart, **dict(zip(COLUMN_NAMES, words)), totals=totals)
 
     def _block_length(self, n: int) -> int:
         """Return the words of a block of n pairs."""
@@ -281,8 +267,7 @@ class Readout:
 
     def _sort_hits(self, count: int, rows: Any = None):
         """Write the first hits in order to rows, by default to the staging memory, and return these. Launches only."""
-        if rows is None:
-            rows = self.staging.room("rows", count, wp.vec3i)
+        rows = self.staging.room("rows", count, wp.vec3i) if rows is None else rows
         order = self.staging.room("order", 2 * count, wp.int32)
         key = self.staging.room("key", 2 * count, wp.int64)
         self.sort.launch(count, order, key, rows, self.staging)

@@ -71,25 +71,14 @@ class Buffers:
 
 
 def check_capacity(capacity) -> Buffers:
-    """Return the buffers of a query.
-
-    Args:
-        capacity: `Buffers`, or the hits that there is room for.
-
-    Raises:
-        ValueError: A number that is out of range, or none.
-    """
+    """Return `Buffers` as they are, or of the hits that there is room for; raise ValueError for no number in range."""
     if isinstance(capacity, Buffers):
         return capacity
     return Buffers(None if capacity is None else whole_number(capacity, "capacity", 1, LIST_MAX))
 
 
 def check_request(output: str, precision: str):
-    """Check output, precision and options of a query.
-
-    Raises:
-        ValueError: An unknown output or precision, or an output that another operator finds.
-    """
+    """Raise ValueError for an unknown output or precision, or an output that another operator finds."""
     if output not in (*OUTPUTS, "contacts", "distance"):
         raise ValueError(f"output {output!r} is none of 'any', 'count', 'faces', 'contacts', 'distance'")
     if precision not in _PRECISION_NAMES:
@@ -100,13 +89,9 @@ def check_request(output: str, precision: str):
 
 
 def check_options(taken: dict, output: str, precision: str, options: dict) -> dict:
-    """Return the options of an output that are not None, nor switches that are off.
+    """Return the options of an output that are not None, nor switches that are off; `taken` is one of the tables above.
 
-    Args:
-        taken: One of the tables above.
-
-    Raises:
-        ValueError: An unknown output or precision, or an option that means nothing for this output.
+    Raises ValueError for an unknown output or precision, or an option that means nothing for this output.
     """
     given = {name: value for name, value in options.items() if value is not None}
     given = {name: value for name, value in given.items() if name not in SWITCHES or flag(value, name)}
@@ -123,11 +108,7 @@ def check_options(taken: dict, output: str, precision: str, options: dict) -> di
 
 
 def check_gap(gap, pair_count, object_count: int) -> np.ndarray:
-    """Return gaps [world units] as float64: () or (p,) beside given pairs, () or (n,) for the broad phase.
-
-    Raises:
-        ValueError: As `check_within`.
-    """
+    """Return gaps [world units] as `check_within`: () or (p,) beside given pairs, () or (n,) for the broad phase."""
     if pair_count is not None:
         return check_within(gap, pair_count, "gap")
     known = f"pairs of the broad phase: one for all, or one for each of {object_count} objects"
@@ -135,11 +116,9 @@ def check_gap(gap, pair_count, object_count: int) -> np.ndarray:
 
 
 def check_within(within, pair_count=None, name="within", known=None) -> np.ndarray:
-    """Return distances [world units] as float64, () or (p,); errors have their name.
+    """Return distances [world units] as float64, () or (p,), for the broad phase one for all; errors have their name.
 
-    Raises:
-        ValueError: Another shape (for pairs of the broad phase any but a scalar), a distance that is negative, infinite
-            or no number.
+    Raises ValueError for another shape, and for a distance that is negative, infinite or no number.
     """
     within = to_numpy(within, name).astype(np.float64)
     if within.shape != () and within.shape != (pair_count,):

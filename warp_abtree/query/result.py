@@ -1,7 +1,7 @@
 """Results of queries."""
 
 import csv
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -56,16 +56,14 @@ class Totals(NamedTuple):
     uncertain: int
 
 
-@dataclass
-class Found:
-    """What a launch found: the arrays of a `Result`, which are its own, on the host or on the device."""
+@dataclass(eq=False)
+class Answers:
+    """Arrays of a `Result`. Any: who asked for them knows that they are not None."""
 
-    totals: Totals
     pairs: Any = None
     any: Any = None
     apart: Any = None
     count: Any = None
-    tests: dict = field(default_factory=dict)  # by the names of COUNTERS
     faces: Any = None
     contacts: Any = None
     pair_contacts: Any = None
@@ -73,13 +71,24 @@ class Found:
     distance: Any = None
     bracket: Any = None
     point_faces: Any = None
-    gradient: Any = None
     time: Any = None
     clear: Any = None
     undecided: Any = None
+    node_tests: Any = None
+    triangle_tests: Any = None
+    float64_tests: Any = None
+    exact_tests: Any = None
 
 
-class Result(DeviceMemory):
+@dataclass(eq=False, kw_only=True)
+class Found(Answers):
+    """What a launch found: the arrays of a `Result`, which are its own, on the host or on the device."""
+
+    totals: Totals
+    gradient: Any = None
+
+
+class Result(DeviceMemory, Answers):
     """What a query found: NumPy arrays, or Warp arrays of the query's device where `device=True` was asked.
 
     Its length is the number of pairs; it has no truth value, `bool(result)` raises TypeError.
@@ -122,31 +131,13 @@ class Result(DeviceMemory):
         names: Of the objects, or none.
     """
 
-    # Any: who asked for them knows that they are not None.
-    pairs: Any
-    any: Any
-    apart: Any
-    faces: Any
-    contacts: Any
-    pair_contacts: Any
-    points: Any
-    distance: Any
-    bracket: Any
-    point_faces: Any
-    time: Any
-    clear: Any
-    undecided: Any
-    node_tests: Any
-    triangle_tests: Any
-    float64_tests: Any
-    exact_tests: Any
-
     def __init__(self, found: Found, room: tuple, output: str, names=()):
-        held = vars(found)
-        vars(self).update({name: held[name] for name in RESULT_ARRAYS}, **found.tests)
-        self.count: Any = found.count if output != "any" else None
-        self._gradient = found.gradient
-        self._totals, self._room, self._names = found.totals, room, names
+        held = dict(vars(found))
+        self._totals, self._gradient = held.pop("totals"), held.pop("gradient")
+        vars(self).update(held)
+        if output == "any":
+            self.count = None
+        self._room, self._names = room, names
 
     def __repr__(self):
         held = [name for name in (*RESULT_ARRAYS[1:], "count") if getattr(self, name) is not None]
@@ -189,13 +180,12 @@ class Result(DeviceMemory):
         Raises:
             CapacityError: A buffer overflowed; the message names the demand.
         """
-        demands = [
-            ("pairs", "object pairs of the broad phase", self._totals.pairs),
-            ("uncertain", "face pairs that need more than float32", self._totals.uncertain),
-            ("hits", "intersecting face pairs", self._totals.hits),
-        ]
-        pairs, hits, uncertain = self._room
-        for (name, what, demand), room in zip(demands, (pairs, uncertain, hits), strict=True):
+        totals, (pairs, hits, uncertain) = self._totals, self._room
+        for name, what, demand, room in (
+            ("pairs", "object pairs of the broad phase", totals.pairs, pairs),
+            ("uncertain", "face pairs that need more than float32", totals.uncertain, uncertain),
+            ("hits", "intersecting face pairs", totals.hits, hits),
+        ):
             if demand > room:
                 raise CapacityError(
                     f"{demand} {what}, the query has room for {room}: make it with capacity=Buffers({name}={demand})"

@@ -1,5 +1,6 @@
 """Hits in the order of `Result.faces`, sorted on the host or on the device."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,11 +54,9 @@ def first_sort(device) -> list:
 
 
 def segment_threads(count: int, pair_room: int, chosen: bool | None) -> int:
-    """Return the threads of a group that sorts the hits of one pair on CUDA, 0 for a radix sort of them all.
+    """Return the threads of a group that sorts the hits of one pair, `count` in all; 0 for a radix sort of them all.
 
-    Args:
-        count: Hits that are sorted, at most.
-        chosen: `Regime.segments`; None: there are few hits a pair on average.
+    `chosen` is `Regime.segments`; None: there are few hits a pair on average.
     """
     mean, thread_max = count / pair_room, sort_segments.SEGMENT_THREADS
     if chosen is None:
@@ -104,11 +103,10 @@ class HitSort:
         self._none = tuple(wp.empty(0, dtype=dtype, device=operator.device) for dtype in (wp.int32, wp.int32, wp.vec3i))
 
     def launch(self, count: int, order, key, rows, staging=None, ends=None) -> bool:
-        """Write the first hits to rows in order; return whether by segments. Launches only.
+        """Write the first hits to rows, device vec3i (count,), in order; return whether by segments. Launches only.
 
         Args:
             order, key: Scratch, device int32 and int64 (2 count,); the keys of the last pass stay.
-            rows: Device vec3i (count,).
             staging: Where there is room for the starts of pairs, if no ends are asked.
             ends: What else is written: where the hits of each pair start, device int32 (pair room + 1,); zeros for
                 int32 (2,); and `ChunkSums.span`, vec3i, by segments alone.
@@ -123,18 +121,14 @@ class HitSort:
             if ends is None:
                 start = first_rows(staging.room("start", room + 1, wp.int32), room + 1)
                 ends, given = (start, *self._none[1:]), (*given, start.ptr)
-            for launch in operator.find_launches(
-                "segments",
-                lambda launch: make_segment_sort(operator.hits, count, threads, key, rows, ends, launch),
-                *given,
-            ):
+            make = partial(make_segment_sort, operator.hits, count, threads, key, rows, ends)
+            for launch in operator.find_launches("segments", make, *given):
                 launch()
             return True
         ends = self._none if ends is None else ends
         passes = sort_passes(room, int(operator.batch.models.face_count.max()), operator.regime.key_bits)
-        *makers, placer = operator.find_launches(
-            "sort", lambda launch: self._make_radix(count, passes, order, key, rows, ends, launch), *given
-        )
+        make = partial(self._make_radix, count, passes, order, key, rows, ends)
+        *makers, placer = operator.find_launches("sort", make, *given)
         for launch, widths in zip(makers, passes, strict=True):
             launch()
             radix_sort(key, order, count, sum(widths))
@@ -142,10 +136,7 @@ class HitSort:
         return False
 
     def _make_radix(self, count, passes, order, key, rows, ends, launch) -> list:
-        """Return what `launch` makes of the kernels that make the keys of each pass, and of the last, that places rows.
-
-        One call of Warp's sort lies behind each pass.
-        """
+        """Make the launches of keys, behind each of which a sort lies, and of the kernel that places rows."""
         start, totals, _ = ends
         hits, device, made = self.operator.hits, self.operator.device, []
         for number, widths in enumerate(passes):

@@ -37,14 +37,12 @@ class Array(NamedTuple):
 
     def make(self, device) -> wp.array:
         """Return a new array."""
-        if self.fill is None or callable(self.fill):
-            array = wp.empty(self.shape, dtype=self.dtype, device=device)
-            if callable(self.fill):
-                self.fill(array)
-            return array
-        if isinstance(self.fill, int) and self.fill == 0:
-            return wp.zeros(self.shape, dtype=self.dtype, device=device)
-        return wp.full(self.shape, self.fill, dtype=self.dtype, device=device)
+        array = wp.empty(self.shape, dtype=self.dtype, device=device)
+        if callable(self.fill):
+            self.fill(array)
+        elif self.fill is not None:
+            array.fill_(self.fill)
+        return array
 
 
 def fields(owner, shape, **types) -> list[Array]:
@@ -103,38 +101,27 @@ class PairDistance:
     """Distances of pairs [world units] that a stage reads: one for all, or one a pair beside given pairs.
 
     Args:
-        name: What errors call it.
-        value: As asked.
-        owner, attribute: What holds the device array of distances, float64 (pair,).
+        name: What errors call it, and the owner's attribute that holds the device array of distances, float64 (pair,).
+        value: The distances, as asked, from `check` on NumPy () or (p,); None where kernels write them.
         check: Returns a value, checked, for a number of pairs, None for those of the broad phase.
-
-    Attributes:
-        value: The distances, NumPy () or (p,); None where kernels write them.
     """
 
-    def __init__(self, name: str, value, owner, attribute: str, check=check_within):
-        self.name, self.value, self._check = name, value, check
-        self._owner, self._attribute = owner, attribute
+    def __init__(self, name: str, value, owner, check=check_within):
+        self.name, self.value, self._owner, self._check = name, value, owner, check
 
     @property
     def rows(self) -> wp.array:
         """The device array of distances."""
-        return getattr(self._owner, self._attribute)
+        return getattr(self._owner, self.name)
 
     def check(self, value, pair_count: int | None) -> np.ndarray:
-        """Return other distances, checked; None stands for those in place.
-
-        Raises:
-            ValueError: Another shape, or a distance that is negative, infinite or no number.
-        """
+        """Return other distances, checked; None stands for those in place."""
         return self._check(self.value if value is None else value, pair_count)
 
     def fill(self):
         """Write the distances to the device."""
-        if self.value is None:
-            return
-        if self.value.ndim == 0:
+        if self.value is not None and self.value.ndim == 0:
             self.rows.fill_(float(self.value))
-        elif len(self.value):
+        elif self.value is not None and len(self.value):
             source = wp.array(self.value, dtype=wp.float64, device="cpu", copy=False)
             wp.copy(self.rows, source, count=len(source))

@@ -73,11 +73,7 @@ def _start_of(memory: np.ndarray, dtype, count: int) -> wp.array:
 
 
 class HostPool:
-    """Blocks of host memory that a device copies into; a block is used again when no array is left on it.
-
-    Args:
-        device: Device that the memory is for: blocks are page-locked for a GPU.
-    """
+    """Blocks of host memory, page-locked for a GPU, that a device copies into; used again without arrays on them."""
 
     def __init__(self, device):
         self._pinned = device.is_cuda
@@ -157,8 +153,7 @@ class Staging:
     def send_records(self, memory: np.ndarray, dtype: np.dtype, count: int, pack):
         """Bring records over, to the start of host memory; returns what is behind them. Does not wait.
 
-        Args:
-            pack: Called as pack(first, count, bytes), launches what writes some of the records to device memory.
+        `pack(first, count, bytes)` launches what writes some of the records to device memory.
         """
         size = dtype.itemsize
         at_once = max(1, min(count, PACKED_AT_ONCE // size))

@@ -41,14 +41,9 @@ OF_HITS = Query, ("output", "precision")
 
 
 class KeptQueries:
-    """Operators of a scene, by what they are asked.
+    """Operators of a `Scene`, kept by what they are asked.
 
-    Args:
-        scene: `Scene` that they are about.
-        find_pairs: Returns given pairs, checked, or where None those of the broad phase up to a distance.
-
-    Attributes:
-        kept: The operators, by what they answer.
+    `find_pairs` returns given pairs, checked, or where None those of the broad phase up to a distance.
     """
 
     def __init__(self, scene, find_pairs: Callable[[Any, float], np.ndarray]):
@@ -70,11 +65,12 @@ class KeptQueries:
         ones = [float(check_within(value, name=name)) for name, value in distances.items() if value.ndim == 0]
         reach, asked, found = max(ones, default=0.0), self._scene, pairs
         key = output, precision, of_originals, *sorted({*distances} - {"beyond"})
+        kind, names = OPERATORS.get(output, OF_HITS)
+        told: dict = {name: value for name, value in (("output", output), ("precision", precision)) if name in names}
         if of_originals:
             originals = self._find_originals()
             asked, found = originals.batch, originals.broad_phase.find(reach) if pairs is None else pairs
         elif (*key, signed) not in self.kept:
-            kind, told = self._kind_of(output, precision)
             stages = kind.plan(**told, **{name: given[name] for name in ("within", "gap") if name in given})
             self._load(stages, output, pairs is None)
         found = self._find_pairs(found, reach)
@@ -85,30 +81,19 @@ class KeptQueries:
                 batch = self._scene.batch()
                 refuse_signed(signed, batch.has_solid(None if pairs is None else found))
                 signed = batch.has_solid(found)  # the broad phase may have found surfaces alone
-        return self._ask((*key, signed), asked, found, checked, tolerances, contact_dtype, device)
-
-    def _ask(self, key, asked, pairs, distances, tolerances, contact_dtype, device) -> Result:
-        """Ask the operator of a key, or one that is made; all is checked."""
-        (output, precision, *_), query = key, self.kept.pop(key, None)
+            told["signed"] = signed
+        key = *key, signed
+        query = self.kept.pop(key, None)
         if query is None:
-            kind, told = self._kind_of(output, precision)
-            if output == "distance":
-                told["signed"] = key[-1]
-            query = kind(asked, pairs=pairs, **told, **distances, **tolerances)
+            query = kind(asked, pairs=found, **told, **checked, **tolerances)
         else:
             if isinstance(query, DistanceQuery):
                 query.set_tolerance(**tolerances)
-            if not query.is_asked(pairs, **distances):
-                query.replace_pairs(pairs, **distances)
+            if not query.is_asked(found, **checked):
+                query.replace_pairs(found, **checked)
         if isinstance(query, ContactQuery):
             query.contact_dtype = contact_dtype
         return self._run(key, query, device)
-
-    @staticmethod
-    def _kind_of(output: str, precision: str) -> tuple:
-        """Return the operator that answers an output, and its keyword arguments that tell output and precision."""
-        kind, names = OPERATORS.get(output, OF_HITS)
-        return kind, {name: value for name, value in (("output", output), ("precision", precision)) if name in names}
 
     def _find_originals(self) -> Originals:
         if self._originals is None:
@@ -133,11 +118,10 @@ class KeptQueries:
     def _load(self, stages: list, output: str, with_broad_phase: bool):
         """Load what a first query launches, all at the same time: from the tree states to the answers."""
         scene, output = self._scene, "faces" if output == "contacts" else output
-        if not scene.object_count:
-            return
-        with_states = scene_kernels(scene.device, [model.face_count for model in scene.models], with_broad_phase)
-        with loading(scene.device, [*operator_kernels(scene.device, stages, output), *with_states]):
-            pass
+        if scene.object_count:
+            kernels = scene_kernels(scene.device, [model.face_count for model in scene.models], with_broad_phase)
+            with loading(scene.device, [*operator_kernels(scene.device, stages, output), *kernels]):
+                pass
 
     def _run(self, key: tuple, query: Operator, device: bool) -> Result:
         """Run an operator and keep it for the next time; one that fails, for lack of memory, gives its own back."""

@@ -41,9 +41,7 @@ class ObjectList:
     def extend(self, models: list[Model], columns: dict[str, list]) -> np.ndarray:
         """Put objects into free places and append the rest, wholly or not at all; return their places.
 
-        Args:
-            models: Of the objects.
-            columns: The other lists by name, an entry an object.
+        `columns` has the other lists by name, an entry an object.
         """
         count, known, taken = len(self), len(self.models), self.free[: len(models)]
         places = [*taken, *range(count, count + len(models) - len(taken))]
@@ -131,9 +129,7 @@ def _without_unused(models: list[Model], model: list[int]) -> dict[str, Any]:
 def check_models(models, count: int) -> list[Model]:
     """Return the model of each of a number of objects: one for all of them, or a list.
 
-    Raises:
-        TypeError: One is no Model.
-        ValueError: Another number of them.
+    Raises TypeError where one is no Model, and ValueError for another number of them.
     """
     listed = [models] * count if isinstance(models, Model) or not isinstance(models, list | tuple) else list(models)
     for model in listed:
@@ -145,15 +141,10 @@ def check_models(models, count: int) -> list[Model]:
 
 
 def check_lods(lods, models: list[Model]) -> list[int]:
-    """Return the LOD of each object, the finest of its model for None.
-
-    Raises:
-        ValueError: Another number of them, or one out of range.
-    """
+    """Return the LOD of each object, the finest of its model for None; raise ValueError for bad ones."""
     if lods is None or _is_one(lods):
         return [model.lod_max if lods is None else model.check_lod(lods) for model in models]
-    lods = check_numbers(lods, "lod", 0, 2**31 - 1, len(models))
-    return [model.check_lod(lod) for model, lod in zip(models, lods)]
+    return list(map(Model.check_lod, models, check_numbers(lods, "lod", 0, 2**31 - 1, len(models))))
 
 
 def _is_one(values) -> bool:
@@ -161,11 +152,7 @@ def _is_one(values) -> bool:
 
 
 def check_numbers(values, what: str, low: int, high: int, count: int) -> list[int]:
-    """Return whole numbers from low to high: one for all objects, or (count,).
-
-    Raises:
-        ValueError: Another shape, or one that is none.
-    """
+    """Return whole numbers from low to high: one for all objects, or (count,); raise ValueError for others."""
     if _is_one(values):
         return [whole_number(values, what, low, high)] * count
     numbers = to_numpy(values, f"{what}s")
@@ -178,11 +165,7 @@ def check_numbers(values, what: str, low: int, high: int, count: int) -> list[in
 
 
 def check_bools(values, what: str, count: int) -> list[bool]:
-    """Return bools: one for all objects, or (count,).
-
-    Raises:
-        ValueError: Another shape or type.
-    """
+    """Return bools: one for all objects, or (count,); raise ValueError for another shape or type."""
     flags = np.asarray(values)
     if flags.ndim == 0 or flags.dtype != bool:
         return [flag(values, what)] * count
@@ -192,11 +175,7 @@ def check_bools(values, what: str, count: int) -> list[bool]:
 
 
 def check_object_names(names, count: int) -> list[str | None]:
-    """Return names: None for all objects, or (count,).
-
-    Raises:
-        ValueError: Another number of them, or one that is no string with a character.
-    """
+    """Return names: None for all objects, or (count,); raise ValueError for other than strings with a character."""
     if isinstance(names, str) or not (names is None or np.iterable(names)):
         raise ValueError(f"names: {names!r} is no list of strings")
     listed = [None] * count if names is None else list(names)
@@ -208,26 +187,20 @@ def check_object_names(names, count: int) -> list[str | None]:
     return [None if name is None else str(name) for name in listed]
 
 
-def check_columns(models, names, worlds, importances, flags, bits) -> dict[str, list]:
+def check_columns(models, name, world, importance, static, solid, group, mask) -> dict[str, list]:
     """Return the columns of `ObjectList` for objects of these models.
 
-    Args:
-        flags: Static and solid ones.
-        bits: Collision groups, and masks.
-
-    Raises:
-        MeshError: A solid whose mesh is not closed.
-        ValueError: Another number of them, or one out of range.
+    Raises MeshError for a solid whose mesh is not closed, and ValueError for another number or what is out of range.
     """
-    count, (statics, solids), (groups, masks) = len(models), flags, bits
+    count = len(models)
     columns: dict[str, list] = {
-        "name": check_object_names(names, count),
-        "world": check_numbers(worlds, "world", EVERY_WORLD, 2**31 - 1, count),
-        "importance": check_numbers(importances, "importance", 1, 3, count),
-        "static": check_bools(statics, "static", count),
-        "solid": check_bools(solids, "solid", count),
-        "group": check_numbers(groups, "collision_group", 0, ALL_BITS, count),
-        "mask": check_numbers(masks, "collision_mask", 0, ALL_BITS, count),
+        "name": check_object_names(name, count),
+        "world": check_numbers(world, "world", EVERY_WORLD, 2**31 - 1, count),
+        "importance": check_numbers(importance, "importance", 1, 3, count),
+        "static": check_bools(static, "static", count),
+        "solid": check_bools(solid, "solid", count),
+        "group": check_numbers(group, "collision_group", 0, ALL_BITS, count),
+        "mask": check_numbers(mask, "collision_mask", 0, ALL_BITS, count),
     }
     for model in {id(model): model for model, solid in zip(models, columns["solid"]) if solid}.values():
         check_solid(model.winding, model.name, stacklevel=3)

@@ -51,11 +51,7 @@ class Penetration:
 
 
 def check_directions(directions) -> np.ndarray:
-    """Return directions (m, 3) or (p, m, 3) as unit vectors, float64 (1, m, 3) or (p, m, 3).
-
-    Raises:
-        ValueError: Another shape, no direction, a number that is not finite, a vector of length 0.
-    """
+    """Return directions (m, 3) or (p, m, 3) as unit vectors, float64 (1, m, 3) or (p, m, 3); refuse what is none."""
     given = to_numpy(directions, "directions")
     if given.ndim not in (2, 3) or given.shape[-1] != 3 or not given.shape[-2] or given.dtype.kind not in "iuf":
         raise ValueError(
@@ -80,10 +76,10 @@ class _PosedBoxes:
 
     def __init__(self, batch: Batch):
         batch.catch_up()
-        self.rotation, self.position = (a.numpy() for a in (batch.objects.pool.rotation, batch.objects.pool.position))
-        states, box = batch.states, np.zeros((len(batch.states.slots), 2, 3))
-        used, state = np.unique(batch.objects.state), batch.objects.state
-        for i in used:
+        pool, state, states = batch.objects.pool, batch.objects.state, batch.states
+        self.rotation, self.position = pool.rotation.numpy(), pool.position.numpy()
+        box = np.zeros((len(states.slots), 2, 3))
+        for i in np.unique(state):
             box[i] = [corners[1] for corners in states.read_nodes(states.slots[i], 2)[:2]]
         self.half = (box[:, 1] - box[:, 0])[state] / 2
         middle = batch.models.pool.centre.numpy()[batch.object_model] + box.mean(1)[state]
@@ -109,13 +105,7 @@ class _PosedBoxes:
 
 
 class _Approaches:
-    """Second objects of pairs, each moved along its pair's directions; the scene's objects stay where they are.
-
-    Args:
-        batch: Of the scene.
-        boxes: Of the batch.
-        pairs, directions: (p, 2) and unit (p, m, 3).
-    """
+    """Second objects of pairs (p, 2), each moved along its pair's directions (p, m, 3); the scene's objects stay."""
 
     def __init__(self, batch: Batch, boxes: _PosedBoxes, pairs, directions):
         self._batch, self._boxes, self._pairs, self._directions = batch, boxes, pairs, directions
@@ -125,10 +115,9 @@ class _Approaches:
         self.way = apart + reach + START_MARGIN * (boxes.size[first] + boxes.size[second])[:, None]
 
     def _place(self, asked, shift):
-        """Return a batch of second objects moved by shifts (k,), for directions of pairs asked (p, m), and first ones.
+        """Return a batch of the objects of pairs asked (p, m), second ones moved by shifts (k,) along the directions.
 
-        Returns:
-            `Batch`, its pairs (k, 2), and the positions that its objects have in the scene.
+        Also its pairs (k, 2), and the positions that its objects have in the scene.
         """
         boxes, (row, k) = self._boxes, np.nonzero(asked)
         still, first = np.unique(self._pairs[row, 0], return_inverse=True)

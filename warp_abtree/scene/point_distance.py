@@ -13,6 +13,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, flag, to_numpy, whole_number
 from warp_abtree.checks.radix_sort import radix_sort
+from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.inside import point_distance as kernels
 from warp_abtree.model.mesh import COORDINATE_MAX
 from warp_abtree.model.model import Model
@@ -26,7 +27,7 @@ RUNS = {"cpu": 256, "cuda": 1}
 # Models whose device arrays are kept for the next call.
 KEPT_MODELS = 4
 TOO_FAR = "has a coordinate beyond 2^300, the most that a mesh may have"
-OUTPUTS = {"distance": wp.float64, "object": wp.int32, "nearest": wp.vec3d, "face": wp.int32}
+OUTPUTS = "distance", "object", "nearest", "face"
 
 _kept: dict[tuple, tuple] = {}
 
@@ -91,9 +92,7 @@ def _measure(scene, asked, points, within, names) -> tuple:
     """Return outputs of points from objects of a scene, rows of (object, whether it has an inside), by their names."""
     most = np.inf if within is None else float(check_within(within, known="points: one distance for all"))
     batch, n, device = scene.batch(), len(points), scene.device
-    found = kernels.PointDistances()
-    for name, dtype in OUTPUTS.items():
-        setattr(found, name, wp.empty(n, dtype=dtype, device=device))
+    found = zeros_of(kernels.PointDistances, n, 0, device)
     if n:
         rows = wp.array(points, dtype=wp.vec3d, device=device)
         run = RUNS["cpu" if device.is_cpu else "cuda"]

@@ -23,12 +23,6 @@ class PosedObjects(DeviceMemory):
     Each object has a place, its index. Where objects are added, removed or changed, operators and captured graphs of
     before say that they are stale; arrays are made anew at the next use, which `set_pose`, `set_poses` and `set_lods`
     do not ask for.
-
-    Args:
-        device: Warp device, such as "cpu" or "cuda:0"; None for Warp's default.
-
-    Raises:
-        ValueError: No such device on this machine.
     """
 
     def __init__(self, device=None):
@@ -129,7 +123,7 @@ class PosedObjects(DeviceMemory):
         """
         models = check_models(model, 1)
         poses = check_poses(to_numpy(pose, "pose")[None], "pose")
-        columns = check_columns(models, [name], world, importance, (static, solid), (collision_group, collision_mask))
+        columns = check_columns(models, [name], world, importance, static, solid, collision_group, collision_mask)
         return int(self._extend(models, poses, lod, columns)[0])
 
     def add_many(
@@ -159,9 +153,7 @@ class PosedObjects(DeviceMemory):
         """
         poses = check_poses(poses)
         models = check_models(models, len(poses))
-        columns = check_columns(
-            models, names, worlds, importances, (statics, solids), (collision_groups, collision_masks)
-        )
+        columns = check_columns(models, names, worlds, importances, statics, solids, collision_groups, collision_masks)
         return self._extend(models, poses, lods, columns)
 
     def _extend(self, models, poses, lods, columns) -> np.ndarray:
@@ -189,9 +181,9 @@ class PosedObjects(DeviceMemory):
             raise ValueError("objects: one is named twice")
         if not removed:
             return
-        named = np.isin(self._excluded >> 32, removed) | np.isin(self._excluded & (2**32 - 1), removed)
-        self._retire("removing an object")
         before = self._excluded
+        named = np.isin(before >> 32, removed) | np.isin(before & (2**32 - 1), removed)
+        self._retire("removing an object")
         try:
             self._excluded = before[~named]
             self._objects.remove(removed)
@@ -217,14 +209,11 @@ class PosedObjects(DeviceMemory):
             RuntimeError: A graph is being captured.
         """
         i, told = self._check_object(i), self._objects
-        given = {"world": world, "importance": importance, "static": static, "solid": solid, "name": name}
+        given = {"world": world, "importance": importance, "static": static, "solid": solid}
         given |= {"group": collision_group, "mask": collision_mask}
         now = {key: getattr(told, key)[i] if value is None else value for key, value in given.items()}
-        flags, bits = (now["static"], now["solid"]), (now["group"], now["mask"])
-        columns = check_columns(
-            [self.models[told.model[i]]], [now["name"]], now["world"], now["importance"], flags, bits
-        )
-        if {key for key, value in given.items() if value is not None} - {"name"}:
+        columns = check_columns([self.models[told.model[i]]], [told.name[i] if name is None else name], **now)
+        if any(value is not None for value in given.values()):
             self._retire("changing an object")
         told.change(i, columns)
         if self._batch is not None:
@@ -332,7 +321,7 @@ class PosedObjects(DeviceMemory):
         if lods.shape != (self.object_count,):
             raise ValueError(f"lods: shape {lods.shape} given for {self.object_count} objects")
         lods = np.where(self.present, lods, 0)
-        if lods.dtype.kind not in "iu" and not (lods.dtype.kind == "f" and (lods == np.floor(lods)).all()):
+        if not (lods == np.floor(lods)).all():
             raise ValueError(f"lods: type {lods.dtype} holds no whole numbers")
         top = np.array([model.lod_max for model in self.models])[self.object_model]
         bad = np.flatnonzero((lods < 0) | (lods > top))

@@ -53,7 +53,7 @@ class Scene(PosedObjects):
         Worlds never mix (-1 is in every one), two static objects never pair, nor do objects whose collision groups and
         masks forbid it; filtered pairs stay out.
         """
-        return self._broad_pairs(0.0)
+        return self._find_pairs(None, 0.0)
 
     @property
     def _queries(self) -> KeptQueries:
@@ -64,12 +64,8 @@ class Scene(PosedObjects):
 
     def _find_pairs(self, pairs, within: float) -> np.ndarray:
         """Return given pairs, checked, or those of the broad phase up to a distance."""
-        return self._broad_pairs(within) if pairs is None else self._check_pairs(pairs)
-
-    def _check_pairs(self, pairs) -> np.ndarray:
-        return check_pairs(pairs, self.object_count, self._objects.free)
-
-    def _broad_pairs(self, within: float) -> np.ndarray:
+        if pairs is not None:
+            return self._check_pairs(pairs)
         check_device(self.device, "Scene.broad_phase")
         if self.object_count < 2:
             return np.empty((0, 2), np.int32)
@@ -77,6 +73,9 @@ class Scene(PosedObjects):
         if "broad phase" not in self._kept:
             self._kept["broad phase"] = BroadPhase(batch)
         return self._kept["broad phase"].find(within)
+
+    def _check_pairs(self, pairs) -> np.ndarray:
+        return check_pairs(pairs, self.object_count, self._objects.free)
 
     def intersect(
         self,

@@ -20,7 +20,7 @@ from warp_abtree.query.stages.distance import DistanceQuery, check_beyond, check
 from warp_abtree.query.stages.intersect import Query
 from warp_abtree.query.stages.motion import FirstContactQuery
 from warp_abtree.scene.scene import Scene
-from warp_abtree.scene.sweep_poses import DeviceRows, PoseSlot, find_copy_stream, refuse_row, take_ends, take_rows
+from warp_abtree.scene.sweep_poses import PoseSlot, find_copy_stream, refuse_row, take_rows
 from warp_abtree.state.arrays import ObjectArrays
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
@@ -81,8 +81,10 @@ class _Chunk:
 
     def trim(self):
         """Give long lists back."""
-        if self.chunk_query is not None and not self.chunk_query.is_small():
-            self.chunk_query = None
+        if self.chunk_query is not None:
+            hits = self.chunk_query.query.hits
+            if len(hits.face) + len(hits.uncertain) > KEPT_ROWS:
+                self.chunk_query = None
 
 
 class _ChunkQuery:
@@ -92,8 +94,7 @@ class _ChunkQuery:
         self.key = key
         self.output, precision, signed, proves = key
         self.device, self.room, self.objects = chunk.batch.device, chunk.room, chunk.batch.objects
-        self.pairs = np.zeros((self.room, 2), np.int32)
-        self.pairs[:, 1] = np.arange(1, self.room + 1)
+        self.pairs = np.stack([np.zeros(self.room, np.int32), np.arange(1, self.room + 1, dtype=np.int32)], 1)
         if self.output == "distance":
             self.query: Any = DistanceQuery(chunk.batch, self.pairs, signed=signed)
         elif self.output == "first_contact":
@@ -120,7 +121,7 @@ class _ChunkQuery:
     def _load(self, slot, poses, start, count):
         """Bring poses into a slot whose last chunk is over."""
         width = slot.width
-        if isinstance(poses, DeviceRows):
+        if poses.flat is not None:
             wp.copy(slot.poses_flat, poses.flat, src_offset=width * start, count=width * count)
             return
         np.copyto(slot.poses_host.numpy().reshape(-1, width)[:count], poses.rows[start : start + count])
@@ -136,19 +137,16 @@ class _ChunkQuery:
         inputs = [wp.float64(POSE_TOLERANCE[slot.width]), slot.poses, objects, slot.report]
         wp.launch(kernel, self.count, inputs, device=self.device)
 
-    def _launch(self, slot):
-        self._place(slot)
-        self.query.launch()
-        inputs = [self.query.hits, slot.report, slot.answer]
-        wp.launch(report_chunk_kernel, self.count, inputs, device=self.device)
-
     def _begin(self, slot, poses, start, count):
         self._load(slot, poses, start, count)
         slot.uncertain_room = len(self.query.hits.uncertain)
         if count != self.count:
             self.query.pair_count.fill_(count)
             self.count = count
-        self._launch(slot)
+        self._place(slot)
+        self.query.launch()
+        inputs = [self.query.hits, slot.report, slot.answer]
+        wp.launch(report_chunk_kernel, self.count, inputs, device=self.device)
         if self.output == "count":
             wp.copy(slot.answer_host, self.query.hits.count, count=count)
         if self.device.is_cuda:
@@ -232,20 +230,10 @@ class _ChunkQuery:
                 found[name][part] = getattr(result, RESULT_NAMES.get(name, name))
         return found
 
-    def is_small(self):
-        return len(self.query.hits.face) + len(self.query.hits.uncertain) <= KEPT_ROWS
-
 
 def apart_rows(output) -> np.dtype:
     """Return the type of the answers of a sweep with `within`."""
     return np.dtype([(output, PACKED_DTYPES[output]), ("apart", np.dtype(bool))])
-
-
-def _keep(key, posed):
-    """Keep what a pair of models has on the device, in place of the pair used longest ago."""
-    _kept[key] = posed
-    for old in list(_kept)[:-KEPT_PAIRS]:
-        _kept.pop(old, None)
 
 
 def sweep(
@@ -310,7 +298,9 @@ def sweep(
     with device_lock(pair.device):
         poses = take_rows(poses, pair.device)
         if output == "first_contact":
-            options["end_poses"] = take_ends(options["end_poses"], len(poses), pair.device)
+            options["end_poses"] = ends = take_rows(options["end_poses"], pair.device, "end_poses")
+            if len(ends) != len(poses):
+                raise ValueError(f"end_poses: {len(ends)} given for {len(poses)} poses")
         for i, (model, lod) in enumerate([(model_a, lod_a), (model_b, lod_b)]):
             pair.add(model, lod=lod, solid=solid[i] if isinstance(solid, tuple | list) and len(solid) == 2 else solid)
         refuse_signed(options.get("signed", False), any(pair.object_solid))
@@ -363,5 +353,7 @@ def _sweep(pair, poses, asked, options):
     else:
         answers = query.find_faces(poses) if output == "faces" else query.find_answers(poses)
     chunk.trim()
-    _keep(key, posed)
+    _kept[key] = posed
+    for old in list(_kept)[:-KEPT_PAIRS]:
+        _kept.pop(old, None)
     return answers

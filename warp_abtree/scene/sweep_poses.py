@@ -11,52 +11,34 @@ from warp_abtree.state.poses import check_poses, device_rows
 SCALARS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
 
 
-class HostRows:
-    """Poses in the memory of the host, rows of 7 or 16 numbers."""
+class PoseRows:
+    """Poses where they lie, rows of 7 or 16 numbers: on the host, or on the device that asks, there also `flat`."""
 
-    def __init__(self, rows):
-        self.rows = rows
-        self.scalar, self.width = SCALARS[rows.dtype], rows.shape[1]
+    def __init__(self, rows: np.ndarray | wp.array):
+        self.rows, self.width = rows, rows.shape[1]
+        self.flat = rows.flatten() if isinstance(rows, wp.array) else None
+        self.scalar = SCALARS[rows.dtype] if self.flat is None else rows.dtype
 
     def __len__(self):
-        return len(self.rows)
+        return self.rows.shape[0]
 
     def row(self, i):
         """Return a row on the host."""
-        return self.rows[i]
-
-
-class DeviceRows:
-    """Poses in the memory of the device that asks, rows of 7 or 16 numbers."""
-
-    def __init__(self, rows):
-        self.scalar, (self.count, self.width) = rows.dtype, rows.shape
-        self.flat = rows.flatten()
-
-    def __len__(self):
-        return self.count
-
-    def row(self, i):
-        """Return a row on the host."""
-        return self.flat[self.width * i : self.width * (i + 1)].numpy()
+        return self.rows[i] if self.flat is None else self.rows[i].numpy()
 
 
 def take_rows(poses, device, what="poses"):
-    """Return poses where they are, or on the host.
-
-    Raises:
-        ValueError: No numbers, or another shape than (p, 7) and (p, 4, 4).
-    """
+    """Return poses where they are, or on the host; raise ValueError for another shape than (p, 7) and (p, 4, 4)."""
     rows = device_rows(poses, device, what)
     if rows is not None:
-        return DeviceRows(rows)
+        return PoseRows(rows)
     rows = to_numpy(poses, what)
     if rows.shape == (0,):
         rows = np.empty((0, 7))
     if not (rows.ndim == 2 and rows.shape[1] == 7) and not (rows.ndim == 3 and rows.shape[1:] == (4, 4)):
         raise ValueError(f"{what}: shape {rows.shape} is neither (p, 7) nor (p, 4, 4)")
     rows = rows.reshape(len(rows), 7 if rows.ndim == 2 else 16)
-    return HostRows(rows if rows.dtype in SCALARS else rows.astype(np.float64))
+    return PoseRows(rows if rows.dtype in SCALARS else rows.astype(np.float64))
 
 
 def refuse_row(poses, i, what="poses"):
@@ -64,18 +46,6 @@ def refuse_row(poses, i, what="poses"):
     row = np.asarray(poses.row(i), np.float64)
     check_poses(row[None] if poses.width == 7 else row.reshape(1, 4, 4), what, first=i)
     raise ValueError(f"{what}: pose {i} is no pose")  # by rounding, where the host finds it just within
-
-
-def take_ends(ends, count: int, device):
-    """Return where motions end as `take_rows` does.
-
-    Raises:
-        ValueError: As `take_rows`; or not as many as there are poses.
-    """
-    rows = take_rows(ends, device, "end_poses")
-    if len(rows) != count:
-        raise ValueError(f"end_poses: {len(rows)} given for {count} poses")
-    return rows
 
 
 @functools.cache

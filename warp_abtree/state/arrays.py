@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.device_memory import DeviceMemory
+from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.base.nodes import clear_node_kernel
 from warp_abtree.kernels.base.poses import SLAB_DEPTH
@@ -16,10 +17,7 @@ from warp_abtree.state.generation import Generation
 # Columns of `StatePool` that mirror the host's slots.
 SLOT_COLUMNS = ("model", "lod", "node_start", "face_start")
 SLOTS_LEAST = 16  # states that the pool has room for at first
-
-
-def _upload(values, dtype, device):
-    return wp.array(values, dtype=dtype, device=device)
+NO_CORNERS = wp.vec4i(-1, -1, -1, -1)  # of a face that is not active
 
 
 class ModelArrays(DeviceMemory):
@@ -27,64 +25,59 @@ class ModelArrays(DeviceMemory):
 
     Attributes:
         pool: `ModelPool` for kernels.
-        device: As given.
         vertex_start, face_start, split_start, node_count, face_count, depth: NumPy, one entry a model.
         split_bounds: split_start of each model, offset into the pool's split_face.
         size: Longest side of each model's box [model units].
     """
 
     def __init__(self, models, device):
-        def starts(lengths):
-            return np.concatenate([[0], np.cumsum(lengths)])
-
-        forests = [model.progressive for model in models]
-        self.vertex_start = starts([len(f.vertex_parent) for f in forests])
-        self.face_start = starts([f.face_count for f in forests])
-        self.split_start = starts([len(f.split_face) for f in forests])
-        self.node_start = starts([model.tree.node_count for model in models])
+        forests, trees = [model.progressive for model in models], [model.tree for model in models]
+        pairs = zip(forests, trees, strict=True)
+        lengths = [(len(f.vertex_parent), f.face_count, len(f.split_face), tree.node_count) for f, tree in pairs]
+        starts = np.concatenate([np.zeros((1, 4), np.int64), np.cumsum(lengths, axis=0)]).T
+        self.vertex_start, self.face_start, self.split_start, self.node_start = starts
         # Vertices are looked up by four times their index in 32 bits.
         for what, total, power in (("vertices", self.vertex_start[-1], 30), ("face slices", self.split_start[-1], 31)):
             if total >= 2**power:
                 raise ValueError(f"the models of one scene hold {total} {what}, more than 2^{power}")
-        self.face_count = np.array([f.face_count for f in forests], np.int64)
-        self.node_count = np.array([model.tree.node_count for model in models], np.int64)
-        self.depth = np.array([model.tree.depth for model in models], np.int64)
+        self.face_count, self.node_count = np.diff(self.face_start), np.diff(self.node_start)
+        self.depth = np.array([tree.depth for tree in trees], np.int64)
         self.lod_max = np.array([f.lod_max for f in forests], np.int64)
         self._forests = forests
         self.size = np.array([np.ptp(f.vertex_pos[: f.vertex_count], axis=0).max() for f in forests])
-        self.split_bounds = [
-            f.split_start.astype(np.int64) + s for f, s in zip(forests, self.split_start[:-1], strict=True)
-        ]
+        self.split_bounds = [f.split_start.astype(np.int64) + s for f, s in zip(forests, self.split_start)]
+        first = self.vertex_start[:-1]
+        parents = [np.where(f.vertex_parent < 0, -1, f.vertex_parent + s) for f, s in zip(forests, first)]
+        centres = np.array([model.centre for model in models])
 
-        def joined(parts, dtype):
-            return _upload(np.ascontiguousarray(np.concatenate(parts)), dtype, device)
+        def joined(parts):
+            return np.concatenate(list(parts))
 
-        parents = [
-            np.where(f.vertex_parent < 0, -1, f.vertex_parent + s).astype(np.int32)
-            for f, s in zip(forests, self.vertex_start[:-1], strict=True)
-        ]
-        corners = [(f.face_vertex + s).astype(np.int32) for f, s in zip(forests, self.vertex_start[:-1], strict=True)]
-        pool = ModelPool()
-        pool.vertex_parent = joined(parents, wp.int32)
-        pool.vertex_pos = joined([np.pad(f.vertex_pos, ((0, 0), (0, 1))) for f in forests], wp.vec4d)
-        near = [np.pad(model.progressive.vertex_pos - model.centre, ((0, 0), (0, 1))) for model in models]
-        pool.vertex_near = joined([x.astype(np.float32) for x in near], wp.vec4)
-        pool.face_vertex = joined(corners, wp.vec3i)
-        pool.face_split = joined([f.face_split for f in forests], wp.int32)
-        pool.split_face = joined([f.split_face for f in forests], wp.int32)
-        pool.leaf_node = joined([model.tree.leaf_node for model in models], wp.int32)
-        pool.node_face = joined([model.tree.node_face for model in models], wp.int32)
-        pool.face_start = _upload(self.face_start[:-1].astype(np.int32), wp.int32, device)
-        pool.face_count = _upload(self.face_count.astype(np.int32), wp.int32, device)
-        pool.depth = _upload(self.depth.astype(np.int32), wp.int32, device)
-        pool.node_start = _upload(self.node_start[:-1].astype(np.int32), wp.int32, device)
-        finest = [s + f.vertex_count for f, s in zip(forests, self.vertex_start[:-1], strict=True)]
-        pool.finest_limit = _upload(np.array(finest, np.int32), wp.int32, device)
-        pool.lod_max = _upload(self.lod_max.astype(np.int32), wp.int32, device)
-        pool.centre = _upload(np.array([model.centre for model in models]), wp.vec3d, device)
-        pool.node_slab = wp.empty(0, dtype=wp.vec4, device=device)
-        pool.slab_gain = wp.zeros(len(models), dtype=wp.vec2i, device=device)
-        self.pool, self.device = pool, device
+        def padded(points):
+            return np.pad(points, ((0, 0), (0, 1)))
+
+        self.device = device
+        self.pool = struct_of(
+            ModelPool,
+            device,
+            vertex_parent=joined(parents),
+            vertex_pos=joined(padded(f.vertex_pos) for f in forests),
+            vertex_near=joined(padded(f.vertex_pos - c).astype(np.float32) for f, c in zip(forests, centres)),
+            face_vertex=joined(f.face_vertex + s for f, s in zip(forests, first)),
+            face_split=joined(f.face_split for f in forests),
+            split_face=joined(f.split_face for f in forests),
+            leaf_node=joined(tree.leaf_node for tree in trees),
+            node_face=joined(tree.node_face for tree in trees),
+            node_slab=np.empty((0, 4)),
+            slab_gain=np.zeros((len(models), 2)),
+            face_start=self.face_start[:-1],
+            face_count=self.face_count,
+            depth=self.depth,
+            node_start=self.node_start[:-1],
+            finest_limit=first + [f.vertex_count for f in forests],
+            lod_max=self.lod_max,
+            centre=centres,
+        )
 
     @property
     def lod_error(self) -> list:
@@ -142,49 +135,37 @@ class StateArrays(DeviceMemory):
         self._allocate_faces(0)
         self._allocate_slots(SLOTS_LEAST)
 
-    def _grow(self):
-        """Count a replacement of arrays."""
+    def _grow(self, kept: int, **made):
+        """Replace arrays of the pool, which keep so many entries, and count that."""
+        for name, array in made.items() if kept else ():
+            wp.copy(array, getattr(self.pool, name), count=kept)
         self.growths += 1
         self.generation.advance()
+        for name, array in made.items():
+            setattr(self.pool, name, array)
 
     def _allocate_nodes(self, count):
-        old, kept = self.pool, self.node_total
-        mark = wp.zeros(count // 32 + 1, dtype=wp.uint32, device=self.device)
-        box = wp.empty(2 * count, dtype=wp.vec4, device=self.device)
-        if kept:
-            wp.copy(box, old.node_box, count=2 * kept)
-        self._grow()
-        self.pool.node_mark, self.pool.node_box = mark, box
+        kept, mark = self.node_total, wp.zeros(count // 32 + 1, dtype=wp.uint32, device=self.device)
+        self._grow(2 * kept, node_box=wp.empty(2 * count, dtype=wp.vec4, device=self.device))
+        self.pool.node_mark = mark
         wp.launch(clear_node_kernel, count - kept, [kept, self.pool], device=self.device)
         self.node_room = count
 
     def _allocate_faces(self, count):
-        old, kept = self.pool, self.face_total
-        array = wp.full(count, wp.vec4i(-1, -1, -1, -1), dtype=wp.vec4i, device=self.device)
-        if kept:
-            wp.copy(array, old.face_corner, count=kept)
-        self._grow()
-        self.pool.face_corner = array
+        self._grow(self.face_total, face_corner=wp.full(count, NO_CORNERS, dtype=wp.vec4i, device=self.device))
         self.face_room = count
 
     def _allocate_slots(self, count):
         made = {name: wp.zeros(count, dtype=wp.int32, device=self.device) for name in SLOT_COLUMNS}
-        kept = len(self.slots)
-        for name, array in made.items():
-            if kept:
-                wp.copy(array, getattr(self.pool, name), count=kept)
-        self._grow()
-        for name, array in made.items():
-            setattr(self.pool, name, array)
+        self._grow(len(self.slots), **made)
         self.slot_room = count
 
     def reserve(self, wanted_models):
         """Take one state for each entry of a list of models and return their ids; contents are whatever stood there.
 
-        Raises:
-            ValueError: The pool would pass 2^30 nodes.
+        Raises ValueError where the pool would pass 2^30 nodes.
         """
-        fresh = []
+        fresh: list[int] = []
         ids = []
         spare = {model: list(ids) for model, ids in self.free.items()}
         for model in wanted_models:
@@ -193,16 +174,17 @@ class StateArrays(DeviceMemory):
             else:
                 ids.append(len(self.slots) + len(fresh))
                 fresh.append(model)
-        nodes = self.node_total + sum(int(self.models.node_count[m]) for m in fresh)
-        faces = self.face_total + sum(int(self.models.face_count[m]) for m in fresh)
+        nodes = self.node_total + int(self.models.node_count[fresh].sum())
+        faces = self.face_total + int(self.models.face_count[fresh].sum())
         if nodes >= 2**30:
             raise ValueError(f"the tree states of the scene would hold {nodes} nodes, more than 2^30; use fewer LODs")
+        slots = len(self.slots) + len(fresh)
         if nodes > self.node_room:
             self._allocate_nodes(max(nodes, min(2 * self.node_room, 2**30 - 1)))
         if faces > self.face_room:
             self._allocate_faces(max(faces, min(2 * self.face_room, 2**31 - 1)))
-        if len(self.slots) + len(fresh) > self.slot_room:
-            self._allocate_slots(max(len(self.slots) + len(fresh), 2 * self.slot_room))
+        if slots > self.slot_room:
+            self._allocate_slots(max(slots, 2 * self.slot_room))
         self.free = spare
         for model in fresh:
             self.slots.append(Slot(model, -1, self.node_total, self.face_total))
@@ -281,12 +263,8 @@ class ObjectArrays(DeviceMemory):
         count = len(worlds)
         self.device = device
         self.state = np.full(count, -1, np.int32)
-        self.pool = ObjectPool()
-        self.pool.state = wp.full(count, -1, dtype=wp.int32, device=device)
-        self.pool.world = _upload(np.asarray(worlds, np.int32), wp.int32, device)
-        self.pool.is_static = _upload(np.asarray(statics, np.int32), wp.int32, device)
-        self.pool.rotation = wp.zeros(count, dtype=wp.mat33d, device=device)
-        self.pool.position = wp.zeros(count, dtype=wp.vec3d, device=device)
+        placed = {"rotation": np.zeros((count, 3, 3)), "position": np.zeros((count, 3))}
+        self.pool = struct_of(ObjectPool, device, state=self.state, world=worlds, is_static=statics, **placed)
         bits = np.asarray(collision_bits, np.uint32).reshape(-1, 2)
         self.collision_bits = wp.array(bits, dtype=wp.vec2ui, device=device)
         self.generation = Generation(device)

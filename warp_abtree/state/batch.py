@@ -12,7 +12,7 @@ from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.generation import Generation
-from warp_abtree.state.lod_update import LodUpdate, replace_states, set_object_lods
+from warp_abtree.state.lod_update import LodUpdate, choose_states
 from warp_abtree.state.solids import SolidArrays
 
 
@@ -23,8 +23,7 @@ class Batch(DeviceMemory):
     their own, on the same models.
 
     Args:
-        models, states: Arrays of one device.
-        objects: Arrays of the same device.
+        models, states, objects: Arrays of one device.
         object_model: Model of each object, int (n,).
         excluded: Keys of pairs that the broad phase leaves out, see `exclusion_keys`.
         solid: Whether each object is a solid, (n,); empty for none.
@@ -32,24 +31,17 @@ class Batch(DeviceMemory):
         names: Of the objects, or none.
 
     Attributes:
-        models, states, objects, object_model, excluded, removed, names: As given.
         solids: `SolidArrays`, None where no object is a solid.
         device: Of the arrays.
         filter_generation: `Generation` of the excluded pairs.
         mean_faces: About how many faces an object has at its LOD, as the host knows it.
     """
 
-    def __init__(
-        self,
-        models: ModelArrays,
-        states: StateArrays,
-        objects: ObjectArrays,
-        object_model,
-        excluded=(),
-        solid=(),
-        removed=(),
-        names=(),
-    ):
+    models: ModelArrays
+    states: StateArrays
+    objects: ObjectArrays
+
+    def __init__(self, models, states, objects, object_model, excluded=(), solid=(), removed=(), names=()):
         self.device = states.device
         self.models, self.states, self.objects = models, states, objects
         self.object_model = np.asarray(object_model)
@@ -121,25 +113,11 @@ class Batch(DeviceMemory):
         solid = () if self.solids is None else self.solids.is_solid
         return Batch(self.models, states, objects, self.object_model, self.excluded, solid, self.removed, self.names)
 
-    def add_finest(self, models):
-        """Make a tree state of some more models at its finest LOD each, and point their objects at it."""
-        states, serving = self.states, self.objects.state.copy()
-        with states.change():
-            ids = states.reserve(models)
-            moves = [(state, int(self.models.lod_max[model]), -1) for state, model in zip(ids, models, strict=True)]
-            update = LodUpdate(self.models, states, moves)
-            for state, model in zip(ids, models, strict=True):
-                serving[self.object_model == model] = state
-            staged = self.objects.stage_states(serving, states)
-            update.launch()
-            self.objects.set_states(serving, staged)
-        self._fit_solids()
-
     def set_lods(self, lods) -> LodUpdate:
         """Bring every object to an LOD, int (n,) within its model's range: wholly, or not at all."""
         self._lead()
         with self.states.change():
-            stats = set_object_lods(self.models, self.states, self.objects, self.object_model, lods)
+            stats = self._bring(lods)
             self._lods = np.array(lods)
         self._fit_solids()
         # The base mesh has a few faces, and each operation adds about as many as any other.
@@ -148,13 +126,43 @@ class Batch(DeviceMemory):
         return stats
 
     def replace_states(self, wanted: list, serving) -> np.ndarray:
-        """Serve objects from states of their own: wholly, or not at all; see `lod_update.replace_states`."""
+        """Make a state for each wanted (model, LOD), serve each object from one of them, int (n,), and free all others.
+
+        Wholly, or not at all; returns their ids, int32.
+        """
         self._lead()
         with self.states.change():
-            ids = replace_states(self.models, self.states, self.objects, wanted, serving)
+            ids = np.array(self.states.reserve([model for model, _ in wanted]), np.int32)
+            moves = [(state, lod, -1) for state, (_, lod) in zip(ids.tolist(), wanted, strict=True)]
+            self._move(moves, ids[serving])
+            self.states.free_others(ids)
             self._lods = np.array([lod for _, lod in wanted], np.int64)[serving]
         self._fit_solids()
         return ids
+
+    def _bring(self, lods) -> LodUpdate:
+        """Bring every object to an LOD, and share states; those that no object uses are freed."""
+        keys, inverse = np.unique((self.object_model.astype(np.int64) << 32) + lods, return_inverse=True)
+        wanted = [(key >> 32, key & (2**32 - 1)) for key in keys.tolist()]
+        used = set(np.unique(self.objects.state[self.objects.state >= 0]).tolist())
+        moves, chosen = choose_states(self.states, set(wanted), used)
+        update = self._move(moves, np.array([chosen[key] for key in wanted], np.int32)[inverse.ravel()])
+        for state in used - set(chosen.values()):
+            self.states.free.setdefault(self.states.slots[state].model, []).append(state)
+        return update
+
+    def _move(self, moves, serving) -> LodUpdate:
+        """Move states as `LodUpdate` does, and point objects at those that serve them, int (n,).
+
+        All that it needs is allocated before the first state in use changes (`StateArrays.change`).
+        """
+        update = LodUpdate(self.models, self.states, moves)
+        moved = not np.array_equal(serving, self.objects.state)
+        staged = self.objects.stage_states(serving, self.states) if moved else None
+        update.launch()
+        if moved:
+            self.objects.set_states(serving, staged)
+        return update
 
     def _fit_solids(self):
         if self.solids is None:
@@ -186,7 +194,7 @@ class Batch(DeviceMemory):
         if self.solids is not None:
             self.solids.forget()
         self.objects.state = np.full(self.object_count, -1, np.int32)
-        set_object_lods(self.models, self.states, self.objects, self.object_model, self.lods)
+        self._bring(self.lods)
         self._fit_solids()
         self.states.generation.resume()
         self.states.torn = False
@@ -225,8 +233,7 @@ def scene_or_batch(scene):
 def check_pairs(pairs, object_count: int, removed=()) -> np.ndarray:
     """Return object pairs as int32 (p, 2).
 
-    Raises:
-        ValueError: Wrong shape, an index that is no object or of those removed, an object paired with itself.
+    Raises ValueError for a wrong shape, an index that is no object or was removed, an object paired with itself.
     """
     pairs = to_numpy(pairs, "pairs")
     if pairs.shape in ((0,), (0, 2)):

@@ -5,19 +5,13 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.base.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import block_update, work_lists
 from warp_abtree.kernels.update import levels as level_kernels
 from warp_abtree.state.arrays import ModelArrays, StateArrays
 from warp_abtree.state.batch import Batch
-from warp_abtree.state.work_lists import (
-    WorkLists,
-    active_update,
-    block_limits,
-    make_level_lists,
-    partial_limit,
-    refine_meshes,
-)
+from warp_abtree.state.work_lists import WorkLists, block_limits, make_level_lists, partial_limit
 
 # LODs wanted on the device that are out of range, and the lowest index that had one.
 NO_FAULTS = (0, 2**31 - 1)
@@ -26,12 +20,8 @@ NO_FAULTS = (0, 2**31 - 1)
 class DeviceLodUpdate(WorkLists):
     """Bring every state of a pool to LODs that stand on the device, planned there: allocates once, launches many.
 
-    The worklists have room for the worst case: every state moves, by the longest slice that is not refitted whole.
-    From the first launch on, LODs of states are known on the device only (`StatePool.lod`).
-
-    Args:
-        models, states: A pool that grows no more.
-        moving: Ids of the states that may be brought to other LODs; None is all.
+    The worklists have room for the worst case: every state of a pool that grows no more moves, or those of some ids, by
+    the longest slice that is not refitted whole. From the first launch on, LODs are known on the device only.
 
     Attributes:
         wanted: LOD of each state, device int32 (s,), to be written before a launch.
@@ -56,43 +46,27 @@ class DeviceLodUpdate(WorkLists):
         marked_room = [int(np.minimum(entries, 1 << level)[depth >= level].sum()) for level in levels]
         whole_room = np.array([np.sum((depth >= level) & (faces > 0)) for level in range(int(LEVEL_MAX))])
 
-        def upload(values):
-            return wp.array(np.asarray(values, np.int64), dtype=wp.int32, device=device)
-
-        def room(length, dtype=wp.int32):
-            return wp.zeros(length, dtype=dtype, device=device)
-
-        self.splits = work_lists.SplitTable()
-        self.splits.bound = upload(np.concatenate(models.split_bounds))
-        self.splits.bound_start = upload(np.cumsum(bounds) - bounds)
-        self.splits.partial_max = upload(partial_max)
-        self.splits.block_max = upload(np.minimum(block_max, 2**31 - 1))
-        self.splits.block_whole = upload(block_whole)
-        plan = work_lists.UpdateLists()
-        plan.partial_total, plan.full_total = room(1, wp.int64), room(1, wp.int64)
-        plan.block_count = room(1)
-        for name in (
-            "block_state",
-            "block_start",
-            "block_length",
-            "partial_state",
-            "slice_start",
-            "entry_end",
-            "full_state",
-            "face_end",
-        ):
-            setattr(plan, name, room(count))
-        plan.changed_count, plan.marked_count = room(len(states.slots)), room(len(states.slots))
-        plan.whole_count = room(int(LEVEL_MAX))
-        plan.whole_start = upload(np.cumsum(whole_room) - whole_room)
-        plan.whole_state = room(int(whole_room.sum()))
-        make_level_lists(plan, marked_room, device)
-        self.wanted = upload([slot.lod for slot in states.slots])
-        self.faults = wp.array(NO_FAULTS, dtype=wp.int32, device=device)
-        blocks = count if (block_whole | (block_max > 0)).any() else 0
-        super().__init__(
-            plan, blocks, int(models.depth.max()), int(entries.sum()), int(faces.sum()), level_room, device
+        self.splits = struct_of(
+            work_lists.SplitTable,
+            device,
+            bound=np.concatenate(models.split_bounds),
+            bound_start=np.cumsum(bounds) - bounds,
+            partial_max=partial_max,
+            block_max=np.minimum(block_max, 2**31 - 1),
+            block_whole=block_whole,
         )
+        lengths = dict.fromkeys(("partial_total", "full_total", "block_count"), 1)
+        lengths |= dict.fromkeys(("block_state", "block_start", "block_length", "partial_state"), count)
+        lengths |= dict.fromkeys(("slice_start", "entry_end", "full_state", "face_end"), count)
+        lengths |= dict.fromkeys(("changed_count", "marked_count"), len(states.slots))
+        lengths |= {"whole_count": int(LEVEL_MAX), "whole_state": int(whole_room.sum())}
+        rooms = {name: np.zeros(length, np.int32) for name, length in lengths.items()}
+        plan = struct_of(work_lists.UpdateLists, device, whole_start=np.cumsum(whole_room) - whole_room, **rooms)
+        make_level_lists(plan, marked_room, device)
+        self.wanted = wp.array([slot.lod for slot in states.slots], dtype=wp.int32, device=device)
+        self.faults = wp.array(NO_FAULTS, dtype=wp.int32, device=device)
+        blocks, deepest = count if (block_whole | (block_max > 0)).any() else 0, int(models.depth.max())
+        super().__init__(plan, blocks, deepest, int(entries.sum()), int(faces.sum()), level_room, device)
 
     def launch(self):
         """Refine meshes and update trees. Launches only: one, where there are trees that no block takes six more, and
@@ -118,17 +92,13 @@ class DeviceLodUpdate(WorkLists):
         wp.launch(work_lists.clear_plan_kernel, max(count, int(LEVEL_MAX)), [self.plan], device=self.device)
         inputs = [self.models.pool, self.splits, self.wanted, self.states.pool, self.plan, self.faults]
         wp.launch(work_lists.plan_update_kernel, count, inputs, device=self.device)
-        self.update_by_blocks(self.models.pool, self.states.pool)
-        refine_meshes(self.models.pool, self.states.pool, self)
-        active_update(self.models.pool, self.states.pool, self)
+        self.update(self.models.pool, self.states.pool)
 
 
 def shares_levels(object_model, levels) -> np.ndarray:
     """Return of each model whether its objects share tree states, one a level: where there are fewer levels than them.
 
-    Args:
-        object_model: Model of each object, int (n,).
-        levels: LODs of each model, a list of arrays.
+    `object_model` has the model of each object, int (n,), `levels` the LODs of each model, a list of arrays.
     """
     lengths = np.array([len(part) for part in levels])
     return np.bincount(object_model, minlength=len(lengths)) > lengths
@@ -156,9 +126,6 @@ class LevelStates:
         levels: `kernels.update.levels.Levels`.
         level_model, level_lod: Model and LOD of each level, int arrays.
         plan: `UpdateLists` of states that are updated; None where there are none.
-
-    Raises:
-        ValueError: The pool would pass 2^30 nodes.
     """
 
     def __init__(self, batch: Batch, levels, lods, shared=None, wanted=None):
@@ -182,28 +149,30 @@ class LevelStates:
         if len(own):
             self._update = DeviceLodUpdate(batch.models, batch.states, ids[len(beforehand) :])
             self.plan = self._update.plan
-        self.wanted = self._int32(self.level_lod[placed]) if wanted is None else wanted
+        if wanted is None:
+            wanted = wp.array(self.level_lod[placed], dtype=wp.int32, device=self.device)
+        self.wanted = wanted
         self.faults = wp.array(NO_FAULTS, dtype=wp.int32, device=self.device)
-        self.levels = self._upload(starts, placed)
-
-    def _int32(self, values):
-        return wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=self.device)
-
-    def _upload(self, starts, placed):
-        made = level_kernels.Levels()
-        made.object_model, made.start = self._int32(self.batch.object_model), self._int32(starts)
-        made.lod, made.state = self._int32(self.level_lod), self._int32(self._level_state)
-        made.level, made.direction = self._int32(placed), self._int32(0 * placed)
-        made.count = self._int32(np.bincount(placed, minlength=len(self.level_lod)))
-        made.state_lod = self._int32([]) if self._update is None else self._update.wanted
-        made.change, made.wanted, made.faults = self._int32(0 * placed), self.wanted, self.faults
-        return made
+        self.levels = struct_of(
+            level_kernels.Levels,
+            self.device,
+            object_model=model,
+            wanted=self.wanted,
+            faults=self.faults,
+            start=starts,
+            lod=self.level_lod,
+            state=self._level_state,
+            level=placed,
+            direction=0 * placed,
+            count=np.bincount(placed, minlength=len(self.level_lod)),
+            state_lod=[] if self._update is None else self._update.wanted,
+            change=0 * placed,
+        )
 
     def launch(self, place: Callable[[], None]):
         """Bring objects to their levels: those of `place`, and those of `DeviceLodUpdate` where states are updated.
 
-        Args:
-            place: Launches a kernel that calls `place_level` for each object.
+        `place` launches a kernel that calls `place_level` for each object.
         """
         try:
             place()

@@ -17,6 +17,11 @@ STALE_GRAPH = (
     "was captured before arrays that it uses were replaced (objects were added, removed or changed, LODs took more "
     "tree states, pairs were filtered out, an update of LODs was interrupted, or a buffer grew); capture it again"
 )
+FAILED_LAUNCHES = {
+    NOT_LAUNCHED: "nothing was launched since this was made or given other pairs",
+    INTERRUPTED: "the last launch was interrupted; launch again",
+    int(STALE): f"the graph of the last launch {STALE_GRAPH}",
+}
 
 
 class Generation:
@@ -36,12 +41,12 @@ class Generation:
         """Count a replacement. To be called before it, so that an interruption between the two is on the safe side."""
         self._uneven = True
         self.number += 1
-        self._write()
+        self.resume()
 
     def given(self) -> int:
         """Return what a launch is given, after bringing to the device what an interruption has kept from it."""
         if self._uneven:
-            self._write()
+            self.resume()
         return self.number
 
     def suspend(self):
@@ -49,10 +54,7 @@ class Generation:
         self.now.fill_(SUSPENDED)
 
     def resume(self):
-        """Let launches of the present generation pass again."""
-        self._write()
-
-    def _write(self):
+        """Let launches of the present generation pass, again."""
         self._uneven = True
         self.now.fill_(self.number)
         self._uneven = False
@@ -171,14 +173,9 @@ class LaunchGuard:
         Raises:
             RuntimeError: Nothing was launched, or a launch was interrupted, or it was of a stale graph.
         """
-        if launched == NOT_LAUNCHED:
-            raise RuntimeError("there is no result: nothing was launched since this was made or given other pairs")
-        if launched == INTERRUPTED:
-            raise RuntimeError("there is no result: the last launch was interrupted; launch again")
-        if launched == int(STALE):
-            raise RuntimeError(f"there is no result: the graph of the last launch {STALE_GRAPH}")
         if launched != self.buffers.number:
-            raise RuntimeError("there is no result: buffers were replaced since the last launch; launch again")
+            why = FAILED_LAUNCHES.get(launched, "buffers were replaced since the last launch; launch again")
+            raise RuntimeError(f"there is no result: {why}")
 
     def clear_stale(self):
         """Forget that a launch was stale."""

@@ -1,33 +1,25 @@
 """LOD updates that the host plans: which state serves which target, and the faces I, R and D that change."""
 
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.base.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import refit
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
-from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
-from warp_abtree.state.work_lists import (
-    WorkLists,
-    active_update,
-    block_limits,
-    make_level_lists,
-    partial_limit,
-    refine_meshes,
-)
+from warp_abtree.state.arrays import NO_CORNERS, ModelArrays, StateArrays
+from warp_abtree.state.work_lists import WorkLists, block_limits, make_level_lists, partial_limit
 
 
 def choose_states(states: StateArrays, wanted: set, used: set) -> tuple[list, dict]:
-    """Choose a state for every wanted (model, lod).
+    """Return moves (state, lod, source), and the state of every wanted (model, lod).
 
     States that stand at a target stay; every other target takes the nearest state that no target keeps, in place,
-    else a new state that starts as a copy of the nearest. Nearest is by the length of the slice between them.
-
-    Returns:
-        The moves, (state, lod, source) each, where source is the state that it starts from: itself, another, or -1 for
-        none; and the state of every wanted (model, lod).
+    else a new state that starts as a copy of the nearest, its source; -1 for none. Nearest is by the length of the
+    slice between them.
     """
     stand = {(states.slots[s].model, states.slots[s].lod): s for s in used}
     chosen = {key: stand[key] for key in wanted if key in stand}
@@ -81,8 +73,8 @@ class LodUpdate(WorkLists):
         longest, whole = block_limits(models, len(self.state), states.device)
         slice_start = self._measure_slices(partial_limit(models, longest, states.device))
         blocks = np.where(self.full, whole[owner], self.slice_length <= longest[owner])
-        plan = self._list_blocks(slice_start, blocks)
-        entries, faces, level_room = self._list_work(plan, slice_start, ~blocks)
+        lists = self._list_blocks(slice_start, blocks)
+        plan, entries, faces, level_room = self._list_work(lists, slice_start, ~blocks)
         super().__init__(plan, int(blocks.sum()), int(models.depth.max()), entries, faces, level_room, states.device)
         self._copies = self._plan_copies()
 
@@ -115,26 +107,21 @@ class LodUpdate(WorkLists):
                 self.full[i], start[i], self.slice_length[i] = False, bounds[low], touched
         return start
 
-    def _list_blocks(self, slice_start, blocks):
-        """Return the plan for kernels with what blocks update, in one transfer: a tenth of the time of one for each."""
+    def _list_blocks(self, slice_start, blocks) -> dict:
+        """Return lists of what blocks update, in one transfer: a tenth of the time of one for each."""
         lengths = np.where(self.full, int(WHOLE), self.slice_length)
-        counts = np.zeros(2 * len(self.states.slots), np.int64)
-        parts = [[blocks.sum()], self.state[blocks], slice_start[blocks], lengths[blocks], counts]
+        counts = np.zeros(len(self.states.slots), np.int64)
+        parts = [[blocks.sum()], self.state[blocks], slice_start[blocks], lengths[blocks], counts, counts]
         array = wp.array(np.concatenate(parts), dtype=wp.int32, device=self.states.device)
-        ends, plan = np.cumsum([len(part) for part in parts]).tolist(), UpdateLists()
-        plan.block_count = array[: ends[0]]
-        plan.block_state = array[ends[0] : ends[1]]
-        plan.block_start = array[ends[1] : ends[2]]
-        plan.block_length = array[ends[2] : ends[3]]
-        middle = (ends[3] + ends[4]) // 2
-        plan.changed_count, plan.marked_count = array[ends[3] : middle], array[middle:]
-        return plan
+        names = "block_count", "block_state", "block_start", "block_length", "changed_count", "marked_count"
+        ends = [0, *np.cumsum([len(part) for part in parts]).tolist()]
+        return {name: array[first:end] for name, (first, end) in zip(names, pairwise(ends), strict=True)}
 
-    def _list_work(self, plan, slice_start, listed):
-        """Add level lists of some updates to the plan; return the room of entries, faces and levels."""
+    def _list_work(self, lists: dict, slice_start, listed):
+        """Return the plan for kernels, with level lists of some updates, and room of entries, faces and levels."""
         partial_id, whole = np.flatnonzero(~self.full & listed), np.flatnonzero(self.full & listed)
         if not listed.any():
-            return 0, 0, []
+            return struct_of(UpdateLists, self.states.device, **lists), 0, 0, []
         depth = self.models.depth[self._owner]
         # Deepest first, so that the states that have a level are the first of the list.
         whole = whole[np.argsort(-depth[whole], kind="stable")]
@@ -145,22 +132,23 @@ class LodUpdate(WorkLists):
         whole_count = np.array([np.sum(depth[whole] >= level) for level in range(int(LEVEL_MAX))], np.int64)
         marked_room = [min(entries, int(np.sum(depth[partial_id] >= level)) << level) for level in levels]
         level_room = [room + (int(whole_count[level]) << level) for level, room in enumerate(marked_room)]
-        device = self.states.device
-
-        def upload(values, dtype=wp.int32):
-            return wp.array(np.asarray(values, np.int64), dtype=dtype, device=device)
-
-        plan.partial_total = upload([(len(partial_id) << 32) + entries], wp.int64)
-        plan.partial_state = upload(self.state[partial_id])
-        plan.slice_start = upload(slice_start[partial_id])
-        plan.entry_end = upload(entry_end)
-        plan.full_total = upload([(len(whole) << 32) + faces], wp.int64)
-        plan.full_state = plan.whole_state = upload(self.state[whole])
-        plan.face_end = upload(face_end)
-        plan.whole_count = upload(whole_count)
-        plan.whole_start = wp.zeros(int(LEVEL_MAX), dtype=wp.int32, device=device)
-        make_level_lists(plan, marked_room, device)
-        return entries, faces, level_room
+        plan = struct_of(
+            UpdateLists,
+            self.states.device,
+            **lists,
+            partial_total=[(len(partial_id) << 32) + entries],
+            partial_state=self.state[partial_id],
+            slice_start=slice_start[partial_id],
+            entry_end=entry_end,
+            full_total=[(len(whole) << 32) + faces],
+            full_state=self.state[whole],
+            face_end=face_end,
+            whole_count=whole_count,
+            whole_start=np.zeros(int(LEVEL_MAX)),
+        )
+        plan.whole_state = plan.full_state
+        make_level_lists(plan, marked_room, self.states.device)
+        return plan, entries, faces, level_room
 
     def _plan_copies(self) -> list:
         """Return the launches that copy the source of every state that starts from another: kernel, dim and inputs."""
@@ -192,64 +180,11 @@ class LodUpdate(WorkLists):
         for state in self.state[self.source < 0]:
             slot = states.slots[state]
             end = slot.face_start + int(models.face_count[slot.model])
-            states.pool.face_corner[slot.face_start : end].fill_(wp.vec4i(-1, -1, -1, -1))
+            states.pool.face_corner[slot.face_start : end].fill_(NO_CORNERS)
         for kernel, threads, inputs in self._copies:
             wp.launch(kernel, dim=threads, inputs=inputs, device=states.device)
         self.relaunch()
 
     def relaunch(self):
         """Refine meshes and update trees from the LODs that stand there. Launches only."""
-        self.update_by_blocks(self.models.pool, self.states.pool)
-        refine_meshes(self.models.pool, self.states.pool, self)
-        active_update(self.models.pool, self.states.pool, self)
-
-
-def replace_states(
-    models: ModelArrays, states: StateArrays, objects: ObjectArrays, wanted: list, serving: np.ndarray
-) -> np.ndarray:
-    """Make states of their own, point objects at them, and free all others; return their ids, int32.
-
-    All that it needs is allocated before the first state in use changes (`StateArrays.change`).
-
-    Args:
-        wanted: Model and LOD of each state.
-        serving: Entry of that list that serves each object, int (n,).
-
-    Raises:
-        ValueError: The pool would pass 2^30 nodes.
-    """
-    ids = np.array(states.reserve([model for model, _ in wanted]), np.int32)
-    moves = [(state, lod, -1) for state, (_, lod) in zip(ids.tolist(), wanted, strict=True)]
-    update, chosen = LodUpdate(models, states, moves), ids[serving]
-    staged = objects.stage_states(chosen, states)
-    update.launch()
-    states.free_others(ids)
-    objects.set_states(chosen, staged)
-    return ids
-
-
-def set_object_lods(
-    models: ModelArrays, states: StateArrays, objects: ObjectArrays, object_model: np.ndarray, lods: np.ndarray
-) -> LodUpdate:
-    """Bring every object to an LOD: refine meshes, update trees, share states; states that no object uses are freed.
-
-    All that it needs is allocated before the first state in use changes (`StateArrays.change`).
-
-    Args:
-        object_model: Model of each object, int (n,).
-        lods: Target LOD of each object, int (n,), within its model's range.
-    """
-    keys, inverse = np.unique((object_model.astype(np.int64) << 32) + lods, return_inverse=True)
-    wanted = [(key >> 32, key & (2**32 - 1)) for key in keys.tolist()]
-    used = set(np.unique(objects.state[objects.state >= 0]).tolist())
-    moves, chosen = choose_states(states, set(wanted), used)
-    update = LodUpdate(models, states, moves)
-    serving = np.array([chosen[key] for key in wanted], np.int32)[inverse.reshape(-1)]
-    moved = not np.array_equal(serving, objects.state)
-    staged = objects.stage_states(serving, states) if moved else None
-    update.launch()
-    if moved:
-        for state in used - set(chosen.values()):
-            states.free.setdefault(states.slots[state].model, []).append(state)
-        objects.set_states(serving, staged)
-    return update
+        self.update(self.models.pool, self.states.pool)

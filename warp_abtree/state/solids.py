@@ -31,13 +31,9 @@ PLACE_ARRAYS = ("parent", "lowest", "face")
 class SolidArrays:
     """Which objects of a batch are solids, and the components of its tree states.
 
-    Args:
-        models, states: Arrays of the batch.
-        is_solid: Whether each object is a solid, (n,).
-
     Attributes:
         pool: `Solids` for kernels.
-        is_solid: As given.
+        is_solid: Whether each object is a solid, (n,).
     """
 
     def __init__(self, models: ModelArrays, states: StateArrays, is_solid):
@@ -69,18 +65,16 @@ class SolidArrays:
         check_device(self.device, "making room for the components of solids")
         lengths = np.diff(self.models.vertex_start)[slots]
         first = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-        if first[-1] >= 2**31:
-            raise ValueError(
-                f"the tree states of solids would hold {first[-1]} vertices, more than 2^31; use fewer LODs"
-            )
+        total = int(first[-1])
+        if total >= 2**31:
+            raise ValueError(f"the tree states of solids would hold {total} vertices, more than 2^31; use fewer LODs")
         room, places = len(self.pool.first), len(self.pool.parent)
-        if len(self.states.pool.lod) > room or first[-1] > places:
-            grown = max(int(first[-1]), min(2 * places, 2**31 - 1))
-            self._allocate(len(self.states.pool.lod), grown if first[-1] > places else places)
-        made = np.full((len(self.pool.first), 3), -1, np.int32)
-        starts = np.full((2, len(made)), -1, np.int32)
-        starts[0, : len(slots)], starts[1, : len(slots)] = first[:-1], first[:-1] - self.models.vertex_start[slots]
-        self.pool.made.assign(made)
+        if len(self.states.pool.lod) > room or total > places:
+            grown = max(total, min(2 * places, 2**31 - 1))
+            self._allocate(len(self.states.pool.lod), grown if total > places else places)
+        starts = np.full((2, len(self.pool.first)), -1, np.int32)
+        starts[:, : len(slots)] = first[:-1], first[:-1] - self.models.vertex_start[slots]
+        self.pool.made.fill_(wp.vec3i(-1))
         self.pool.first.assign(starts[0])
         self.pool.shift.assign(starts[1])
         self._slot_models = slots

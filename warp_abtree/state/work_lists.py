@@ -40,11 +40,7 @@ def launch_items(kernel, items: int, inputs: list, device):
 
 
 def update_kernels(face_counts, device) -> list:
-    """Return the kernels, with block sizes, that bring a state of each model to its first LOD; see `loading`.
-
-    Args:
-        face_counts: Faces of each model.
-    """
+    """Return the kernels, with block sizes, that bring states of models of so many faces to their first LODs."""
     most = 2 ** int(block_update.BLOCK_DEPTH) if device.is_cpu else BLOCK_FACES
     by_blocks = [current_regime().block_updates and count <= most for count in face_counts]
     kernels: list = [(block_update.state_update(False), block_update.BLOCK_THREADS)] if any(by_blocks) else []
@@ -57,9 +53,7 @@ def update_kernels(face_counts, device) -> list:
 def block_limits(models, state_count: int, device):
     """Return the longest slice that a block takes of each model, 0 where none, and whether it refits them whole.
 
-    Args:
-        models: `ModelArrays`.
-        state_count: States that may be updated at once.
+    At most `state_count` states are updated at once.
     """
     fits = (models.depth <= block_update.BLOCK_DEPTH) & current_regime().block_updates
     if not device.is_cuda:
@@ -72,9 +66,6 @@ def partial_limit(models, block_max, device):
     """Return the longest slice of each model that a partial update takes; negative where all are refitted whole.
 
     On a GPU level lists with little on each level take as long as with much, so few faces are worth it.
-
-    Args:
-        block_max: As `block_limits` returns it.
     """
     most = full_refit_fraction(device) * models.face_count
     listed = LISTED_FRACTION * most if device.is_cuda else most
@@ -111,10 +102,12 @@ class WorkLists(DeviceMemory):
         words = 1 if self.device.is_cuda else int(block_update.MARK_WORDS)
         self._scratch = wp.empty(words, dtype=wp.uint32, device=self.device)
 
-    def update_by_blocks(self, models, states):
-        """Refine meshes and update trees of the listed states that a block takes each. One launch."""
+    def update(self, models, states):
+        """Refine meshes and update trees of `ModelPool` and `StatePool`, by blocks and by lists. Launches only."""
         if self.block_room:
             self.launch_blocks(block_update.state_update, self.block_room, [models, self._scratch, states, self.plan])
+        refine_meshes(models, states, self)
+        active_update(models, states, self)
 
     def launch_blocks(self, update, count: int, inputs: list):
         """Launch the kernel that `update` makes, a block for each of so many states, or fewer that take turns."""
@@ -138,11 +131,7 @@ def make_level_lists(plan: UpdateLists, marked_room: list, device):
 
 
 def refine_meshes(models, states, work: WorkLists):
-    """Set the active ancestors of every face corner that changes. Launches only.
-
-    Args:
-        models, states: `ModelPool` and `StatePool` of one device.
-    """
+    """Set the active ancestors of every face corner that changes, of `ModelPool` and `StatePool`. Launches only."""
     launch_items(refine.refine_slice_kernel, work.entry_room, [models, work.plan, states], work.device)
     launch_items(refine.refine_all_kernel, work.face_room, [models, states, work.plan], work.device)
 
@@ -170,11 +159,7 @@ def active_update(models, states, work: WorkLists):
     """Bring boxes, status and skip links to the corners that refinement has set (ACTIVE-UPDATE).
 
     Leaves the very same bits as a rebuild of all boxes at that LOD. Launches only, two and one for each level that has
-    much to refit; no host synchronisation.
-
-    Args:
-        models, states: `ModelPool` and `StatePool` of one device.
-        work: What to update; its worklists and counters are written.
+    much to refit.
 
     Source: Liu et al. 2006, section 3.2.2, ACTIVE-UPDATE; Algorithm 1.
     """

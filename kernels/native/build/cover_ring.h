@@ -22,12 +22,9 @@ void bound_firsts(const NearFaces& near, const Covers& covers, const double* cor
                 over[x][k] = near.place[first >> 3][x][first & 7];
         }
         FaceLanes firsts;
-        firsts.load(over);
-        for (int k = 0; k < 9; k += 3) {
-            const FaceLanes::Point p = {*(const lanes*)corner[k], *(const lanes*)corner[k + 1],
-                                        *(const lanes*)corner[k + 2]};
-            found = FaceLanes::higher(found, firsts.distance_sq(p));
-        }
+        firsts.load(NearFaces::points(over, 0), NearFaces::points(over, 3), NearFaces::points(over, 6));
+        for (int k = 0; k < 9; k += 3)
+            found = FaceLanes::higher(found, firsts.distance_sq(NearFaces::points(corner, k)));
         *(lanes*)(first_bound + (i - begin)) = has_first ? found : lanes{} + __builtin_inf();
     }
 }

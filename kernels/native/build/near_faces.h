@@ -1,29 +1,7 @@
 // The faces about a merge as groups of 8, and their distances to the corners of polygons.
 #pragma once
 #include "builtin.h"
-#include "build/face_lanes.h"
-#include "base/sizes.h"
-
-// A corner of a polygon, and where its distances to the faces stand.
-struct Corner {
-    double x, y, z;
-    const double* distance;
-};
-
-struct Polygon {
-    int count;
-    Corner corner[POLYGON_CORNERS];
-
-    Polygon() : count(0) {}
-    Polygon(const Polygon& other) { *this = other; }
-    // The corners in use alone.
-    Polygon& operator=(const Polygon& other) {
-        count = other.count;
-        for (int i = 0; i < count; ++i)
-            corner[i] = other.corner[i];
-        return *this;
-    }
-};
+#include "build/faces64.h"
 
 struct NearFaces {
     typedef FaceLanes::lanes lanes;
@@ -57,14 +35,19 @@ struct NearFaces {
         }
         face[count++] = f;
     }
+    // Points of x, y and z from a row on, 8 each.
+    static FaceLanes::Point points(const double (&rows)[9][8], int row) {
+        auto at = [&](int i) { return *(const lanes*)rows[row + i]; };
+        return FaceLanes::Point{at(0), at(1), at(2)};
+    }
     void load_groups(int from) {
         groups = (count + 7) / 8;
         for (int g = from; g < groups; ++g)
-            group[g].load(place[g]);
+            group[g].load(points(place[g], 0), points(place[g], 3), points(place[g], 6));
     }
-    // Not inlined, as `PolygonCuts::cut`: both have many callers, and compiling takes long.
+    // Not inlined, as `cut_polygon`.
     __attribute__((noinline)) void measure(const Corner& p, double* row) const {
-        const FaceLanes::Point q = FaceLanes::spread(p.x, p.y, p.z);
+        const FaceLanes::Point q = {p.x - lanes{}, p.y - lanes{}, p.z - lanes{}};
         for (int g = 0; g < groups; ++g)
             *(lanes*)(row + 8 * g) = group[g].distance_sq(q);
     }
@@ -73,17 +56,24 @@ struct NearFaces {
         const lanes place_in = {0, 1, 2, 3, 4, 5, 6, 7};
         return place_in < double(count - 8 * g) ? found : lanes{} + __builtin_inf();
     }
-    static int lane_of(const lanes& found, double value) { return __builtin_ctz(Float64::to_mask(found == value)); }
+    static int find_lane(const lanes& found, double value) { return __builtin_ctz(Float64::to_mask(found == value)); }
+    // The least of all lanes.
+    static double least_of(lanes v) {
+        v = FaceLanes::lower(v, __builtin_shufflevector(v, v, 4, 5, 6, 7, 0, 1, 2, 3));
+        v = FaceLanes::lower(v, __builtin_shufflevector(v, v, 2, 3, 0, 1, 6, 7, 4, 5));
+        v = FaceLanes::lower(v, __builtin_shufflevector(v, v, 1, 0, 3, 2, 5, 4, 7, 6));
+        return v[0];
+    }
     // As `point_nearest_face`.
     int nearest(const double* row, double& least) const {
         int best = -1;
         least = __builtin_inf();
         for (int g = 0; g < groups; ++g) {
             const lanes found = those_of(*(const lanes*)(row + 8 * g), g);
-            const double here = FaceLanes::least(found);
+            const double here = least_of(found);
             if (here < least) {
                 least = here;
-                best = 8 * g + lane_of(found, here);
+                best = 8 * g + find_lane(found, here);
             }
         }
         return best;
@@ -98,10 +88,10 @@ struct NearFaces {
                 worst = FaceLanes::higher(worst, *(const lanes*)(p.corner[k].distance + 8 * g));
             worst = those_of(worst, g);
             const unsigned int within = Float64::to_mask(worst <= limit);
-            const double here = within ? worst[__builtin_ctz(within)] : FaceLanes::least(worst);
+            const double here = within ? worst[__builtin_ctz(within)] : least_of(worst);
             if (here < bound) {
                 bound = here;
-                best = 8 * g + (within ? __builtin_ctz(within) : lane_of(worst, here));
+                best = 8 * g + (within ? __builtin_ctz(within) : find_lane(worst, here));
             }
         }
         return best;

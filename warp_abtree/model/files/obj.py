@@ -22,12 +22,12 @@ def _parse_plain_obj(data) -> FileSurface | None:
     corners = _plain_triples([line[2:] for line in lines if line[:2] == b"f "], int)
     if points is None or corners is None or corners.min() <= 0 or corners.max() > len(points):
         return None
-    parts, count = _Parts(), 0
+    begun, count = [], 0
     for line in lines if b"o " in starts else ():
         if line[:2] == b"o ":
-            parts.begin(line, count)
+            begun.append((line, count))
         count += line[:2] == b"f "
-    return FileSurface(points, corners - 1, *parts.of(np.ones(count, int)))
+    return FileSurface(points, corners - 1, *_find_parts(begun, np.ones(count, int)))
 
 
 def _plain_triples(rows, number) -> np.ndarray | None:
@@ -43,24 +43,19 @@ def _plain_triples(rows, number) -> np.ndarray | None:
         return None
 
 
-class _Parts:
-    """The objects that a file's lines begin: each `o` line one, whatever its name."""
+def _find_parts(begun: list, triangle_counts) -> tuple:
+    """Return the names of the parts, and the part of each triangle; None for one part.
 
-    def __init__(self):
-        self.names: list[str | None] = [None]
-        self.starts = [0]
-
-    def begin(self, line, polygon_count):
-        """Begin an object with the next polygon."""
-        self.names.append(b" ".join(line.split()[1:]).decode(errors="replace") or None)
-        self.starts.append(polygon_count)
-
-    def of(self, triangle_counts):
-        """Return the names of the parts, and the part of each triangle, for the triangles of each polygon."""
-        if len(self.names) == 1:
-            return (None,), None
-        parts = np.searchsorted(self.starts, np.arange(len(triangle_counts)), side="right") - 1
-        return tuple(self.names), np.repeat(parts, triangle_counts)
+    Args:
+        begun: Lines that begin an object, each `o` line one whatever its name, and how many polygons stand before.
+        triangle_counts: Triangles of each polygon.
+    """
+    if not begun:
+        return (None,), None
+    names = [b" ".join(line.split()[1:]).decode(errors="replace") or None for line, _ in begun]
+    starts = [0, *(count for _, count in begun)]
+    parts = np.searchsorted(starts, np.arange(len(triangle_counts)), side="right") - 1
+    return (None, *names), np.repeat(parts, triangle_counts)
 
 
 def read_obj(data: bytes, where: str, remarks: Remarks) -> FileSurface:
@@ -68,13 +63,13 @@ def read_obj(data: bytes, where: str, remarks: Remarks) -> FileSurface:
     plain = _parse_plain_obj(data)
     if plain is not None:
         return plain
-    vertices, corners, counts, parts = [], [], [], _Parts()
+    vertices, corners, counts, begun = [], [], [], []
     for number, line in enumerate(data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines(), start=1):
         fields = line.split()
         kind = fields[0] if fields else b""
         if kind != b"v" and kind != b"f":
             if kind == b"o":
-                parts.begin(line, len(counts))
+                begun.append((line, len(counts)))
             elif kind in LEFT_OUT:
                 remarks.add("left out", LEFT_OUT[kind])
             continue
@@ -108,4 +103,4 @@ def read_obj(data: bytes, where: str, remarks: Remarks) -> FileSurface:
     except OverflowError:
         raise MeshError(f"{where}: a face refers to vertex {max(corners)}, but there are {len(points)}") from None
     polygons = np.array(counts)
-    return FileSurface(points, triangulate(points, polygons, indices, where), *parts.of(polygons - 2))
+    return FileSurface(points, triangulate(points, polygons, indices, where), *_find_parts(begun, polygons - 2))

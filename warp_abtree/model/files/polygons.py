@@ -52,8 +52,13 @@ def cut_strip(corners):
     """Return the triangles of a triangle strip, all wound as the first, without those that repeat a corner."""
     triangles = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
     triangles[1::2] = triangles[1::2, [1, 0, 2]]
-    a, b, c = triangles.T
-    return triangles[(a != b) & (b != c) & (c != a)]
+    return triangles[distinct_corners(triangles)]
+
+
+def distinct_corners(faces):
+    """Return which faces have three distinct corners."""
+    a, b, c = faces.T
+    return (a != b) & (b != c) & (c != a)
 
 
 def _clip_ears(points):

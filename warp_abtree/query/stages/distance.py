@@ -80,28 +80,19 @@ def check_beyond(beyond, pair_count=None) -> np.ndarray:
 
 
 def check_tolerances(tolerance=0.0, relative=0.0) -> tuple[float, float]:
-    """Return the tolerances of a search."""
-    return check_tolerance(tolerance, "tolerance", math.inf), check_tolerance(relative, "relative", 1.0)
-
-
-def check_tolerance(tolerance, name: str, most: float) -> float:
-    """Return a tolerance.
-
-    Raises:
-        ValueError: No number from 0 up to below the most.
-    """
-    # Plain numbers, as most are, in a tenth of the time.
-    value = tolerance if type(tolerance) is float else to_numpy(tolerance, name)
-    if np.ndim(value) or not 0 <= value < most:
-        raise ValueError(f"{name}: {tolerance!r} is no number of 0 or more, below {most}")
-    return float(value)
+    """Return the tolerances of a search; raise ValueError for no number from 0 up, a relative one below 1."""
+    for name, asked, most in (("tolerance", tolerance, math.inf), ("relative", relative, 1.0)):
+        # Plain numbers, as most are, in a tenth of the time.
+        value = asked if type(asked) is float else to_numpy(asked, name)
+        if np.ndim(value) or not 0 <= value < most:
+            raise ValueError(f"{name}: {asked!r} is no number of 0 or more, below {most}")
+    return float(tolerance), float(relative)
 
 
 def check_distance_options(options: dict) -> tuple[dict, bool, bool]:
     """Return tolerances, whether distances are signed, and whether of originals; of options that are given.
 
-    Raises:
-        ValueError: A bad one, or depths of originals are asked: depths are those of LODs.
+    Raises ValueError for a bad one, or where depths of originals are asked: depths are those of LODs.
     """
     signed, originals = (flag(options.get(name, False), name) for name in ("signed", "originals"))
     if signed and originals:
@@ -115,27 +106,23 @@ class DistanceStage(Stage):
     """Find the distances of the pairs that do not intersect, and points of those that do.
 
     Args:
-        beyond: Distances that end the search of a pair, as `check_beyond` returns them.
-        tolerances: As `check_tolerances` returns them.
+        beyond, tolerances: When the search of a pair ends, as `check_beyond` and `check_tolerances` return them.
         signed: Whether pairs have depths.
         inside: `InsideStage`, the stage before; None for surfaces alone.
         with_points: Whether pairs that intersect have points.
-
-    Attributes:
-        distances: As of `DistanceQuery`.
-        found: What the search keeps of each pair, `frame.NearestFound`.
     """
 
     memory: wp.array  # of each thread of the CPU
+    asked_tolerances: tuple = ()
 
     def __init__(
         self, beyond, tolerances=(0.0, 0.0), signed=False, inside: InsideStage | None = None, with_points=True
     ):
-        self.asked_tolerances, self._signed, self._inside, self._with_points = tolerances, signed, inside, with_points
+        self._signed, self._inside, self._with_points = signed, inside, with_points
         self._tolerances = frame.Tolerances()
-        self._tolerances.tolerance, self._tolerances.relative = tolerances
+        self.take_tolerances(tolerances)
         self.distances, self.found, self.slabs = report.Distances(), frame.NearestFound(), mean_slabs.Slabs()
-        self.distance = PairDistance("beyond", beyond, self.found, "beyond", check_beyond)
+        self.distance = PairDistance("beyond", beyond, self.found, check_beyond)
         self._views: dict = {}
         self._made_for: tuple = ()
 
@@ -210,9 +197,8 @@ class DistanceStage(Stage):
             operator.launch_all("distances", self._make_distances)
         else:
             cores = self._cores()
-            *first, last = operator.commands.find(
-                "distances", (cores == 1, *operator.guard.given()), self._make_distances
-            )
+            given = cores == 1, *operator.guard.given()
+            *first, last = operator.commands.find("distances", given, self._make_distances)
             for command in first:
                 command.launch()
             launch_on_cores(last.launch, cores)

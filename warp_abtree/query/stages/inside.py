@@ -10,13 +10,9 @@ from warp_abtree.query.stage import Array, Rooms, Stage
 
 
 class InsideStage(Stage):
-    """Find what is inside solids, of the pairs whose surfaces do not meet; nothing where there are no solids.
+    """Find what is inside solids, of the pairs whose surfaces do not meet; nothing where there are no solids."""
 
-    Attributes:
-        contained: Face of what is inside, device int32 (pair,).
-    """
-
-    contained: wp.array
+    contained: wp.array  # face of what is inside, device int32 (pair,)
 
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return the faces."""

@@ -17,23 +17,22 @@ from warp_abtree.query.stages.traversal import AskedHits, AskedVisits, Traversal
 
 
 class HitStage(Stage):
-    """A stage that counts hits of each pair.
-
-    Attributes:
-        hits: Device arrays of the last launch, `kernels.intersect.face_pairs.Hits`.
-        counts: Its counters, device int64; rows: hits, then what `COUNTERS` names.
-    """
+    """A stage that counts hits of each pair: `hits`, and `counts`, rows of its counters, as `Operator` has them."""
 
     counts: wp.array
 
-    def __init__(self):
-        self.hits = face_pairs.Hits()
+    def __init__(self, asked: AskedHits | AskedVisits):
+        self.hits, self._asked = face_pairs.Hits(), asked
 
     def attach(self, operator: Operator):
         """Take the operator."""
         super().attach(operator)
         for name in ("total", "uncertain_total", "inexact_total"):
             setattr(self.hits, name, wp.zeros(1, dtype=wp.int32, device=operator.device))
+
+    def kernels(self, device) -> list:
+        """Return the kernels of the traversal."""
+        return traversal_kernels(device, current_regime(), self._asked)
 
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return what has an entry a pair."""
@@ -52,25 +51,20 @@ class IntersectStage(HitStage):
     """Find the faces of each pair that intersect, and with a gap those that are nearer than it.
 
     Args:
-        output: "any", "count" or "faces".
-        precision: As for `Query`.
+        output, precision: As for `Query`.
         with_gap: Whether the hits have gaps.
-        slots: `SlotStage` that reduces what is apart, or None where it is reported.
         reads: Whether results have the hits as rows.
+        slots: `SlotStage` that reduces what is apart, or None where it is reported.
         resting: `MemoryStage` of pairs that are passed over, or None.
-
-    Attributes:
-        traversal: `Traversal`, which other stages share.
     """
 
     traversal: Traversal
 
     def __init__(self, output="any", precision="exact", with_gap=False, reads=True, slots=None, resting=None):
-        super().__init__()
-        self._slots = slots if with_gap else None
+        self._slots, self._resting = slots if with_gap else None, resting
         self._is_exact, self._with_gap, self._reads = precision == "exact", with_gap, reads and output == "faces"
         mode = int(face_pairs.GAP if with_gap else PRECISIONS[precision])
-        self._asked, self._resting = AskedHits(mode, int(OUTPUTS[output]), self._slots is not None), resting
+        super().__init__(AskedHits(mode, int(OUTPUTS[output]), self._slots is not None))
 
     def attach(self, operator: Operator):
         """Take the operator, and give it the hits."""
@@ -82,26 +76,19 @@ class IntersectStage(HitStage):
         operator.hits, operator.traversal, operator.lists_hits = self.hits, self.traversal, self._reads
         operator.lists_apart = self._slots is not None
 
-    def kernels(self, device) -> list:
-        """Return the kernels of the traversal."""
-        return traversal_kernels(device, current_regime(), self._asked)
-
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return the arrays of hits, and the lists of face pairs that wait."""
-        waiting = rooms.uncertain if self.operator.uses_warps() else 0
-        if self._slots is not None:
-            waiting = -(-waiting // APART_FOR_UNCERTAIN)
+        apart = rooms.uncertain if self.operator.uses_warps() else 0
+        waiting = apart if self._slots is None else -(-apart // APART_FOR_UNCERTAIN)
         lists = {"face": rooms.hits, "uncertain": waiting, "inexact": waiting if self._is_exact else 0}
-        if self._with_gap:
-            lists["apart"] = rooms.uncertain if self.operator.uses_warps() else 0
+        lists |= {"apart": apart} if self._with_gap else {}
         made = [Array(self.hits, name, wp.vec3i, room) for name, room in lists.items()]
         return [*super().arrays(rooms), *self.traversal.arrays(rooms), *made]
 
     def search(self):
         """Traverse the pairs in place. Launches only."""
         within = self.hits.gap if self._with_gap else self._no_distance
-        if self._resting is not None:
-            within = self._resting.asked
+        within = within if self._resting is None else self._resting.asked
         slots = None
         if self._slots is not None:
             self._slots.start()
@@ -117,25 +104,17 @@ class IntersectStage(HitStage):
 class VisitStage(HitStage):
     """Visit the face pairs of each pair that are not proved farther apart than a distance.
 
-    Args:
-        within: Distances [world units], see `PairDistance`.
-        question: What visits ask.
-        own: What they are given.
-
     Attributes:
-        within: The distances, device float64 (pair,).
+        within: Distances [world units], see `PairDistance`, device float64 (pair,).
+        question: What visits ask, of what they are given: `own`.
     """
 
     within: wp.array
 
     def __init__(self, within, question: Question, own):
-        super().__init__()
-        self.distance = PairDistance("within", within, proxy(self), "within")
-        self.question, self._asked, self._own = question, AskedVisits(question), own
-
-    def kernels(self, device) -> list:
-        """Return the kernels of the traversal."""
-        return traversal_kernels(device, current_regime(), self._asked)
+        super().__init__(AskedVisits(question))
+        self.distance = PairDistance("within", within, proxy(self))
+        self.question, self._own = question, own
 
     def boxes(self, boxes):
         """Return boxes that are wider by half of the distance."""
@@ -152,11 +131,7 @@ class VisitStage(HitStage):
 
 
 class ApartStage(VisitStage):
-    """Find the pairs that are not proved farther apart than a distance.
-
-    Attributes:
-        hits: any_hit is 0 where a pair is proved apart.
-    """
+    """Find the pairs that are not proved farther apart than a distance: their any_hit is not 0."""
 
     def __init__(self, within):
         super().__init__(within, PROVED_APART, 0)
@@ -168,26 +143,18 @@ class ApartStage(VisitStage):
 
 
 class GapStage(Stage):
-    """Distances within which faces of a pair count as near: given, or the sum of what each of its objects has.
-
-    Args:
-        gap: As for `ContactQuery`.
-    """
+    """Distances within which faces of a pair count as near: given, or the sum of what each of its objects has."""
 
     def __init__(self, gap):
         self._gap, self._hits = gap, face_pairs.Hits()
         self._reach: wp.array | None = None  # part of each object, where the broad phase makes pairs
 
     def give_to(self, hits, precision: str):
-        """Let hits have the gap of each pair.
-
-        Raises:
-            ValueError: Another precision than "exact".
-        """
+        """Let hits have the gap of each pair; raise ValueError for another precision than "exact"."""
         if precision != "exact":
             raise ValueError(f"gap: needs precision 'exact', not {precision!r}")
         self._hits = hits
-        self.distance = PairDistance("gap", None, hits, "gap", lambda value, count: check_gap(value, count, 0))
+        self.distance = PairDistance("gap", None, hits, lambda value, count: check_gap(value, count, 0))
 
     def attach(self, operator: Operator):
         """Take the operator, and check the gap; what the broad phase reads of it goes to the device."""
@@ -257,19 +224,7 @@ class Query(Operator):
 
     @staticmethod
     def plan(output="faces", precision="exact", within=None) -> list[Stage]:
-        """Return the stages of a query.
-
-        Raises:
-            ValueError: An unknown output or precision.
-        """
+        """Return the stages of a query; raise ValueError for an unknown output or precision."""
         check_request(output, precision)
         first = [] if within is None else [ApartStage(within)]
         return [*first, IntersectStage(output, precision), InsideStage()]
-
-    def set_pairs(self, pairs, within=None):
-        """Query other pairs from now on, in the room there is if they fit; within None keeps the distances.
-
-        Raises:
-            ValueError: Bad pairs or distances, a query that runs the broad phase, or distances for one made without.
-        """
-        self.ask_pairs(pairs, within=within)

@@ -26,6 +26,7 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, flag, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.checks.regime import current_regime
+from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.motion import face_pair, group, path, search, start
@@ -45,21 +46,11 @@ TOLERANCE_LEAST = 2.0**-40
 
 
 def check_time_tolerance(tolerance) -> float:
-    """Return a tolerance of times.
-
-    Raises:
-        ValueError: No number from 2^-40 up to below 1.
-    """
+    """Return a tolerance of times; raise ValueError for no number from 2^-40 up to below 1."""
     value = to_numpy(tolerance, "tolerance")
     if value.shape != () or value.dtype.kind not in "iuf" or not TOLERANCE_LEAST <= value < 1:
         raise ValueError(f"tolerance: {tolerance!r} is no number of 2^-40 or more, below 1")
     return float(value)
-
-
-def check_path(screw, linear):
-    """Raise ValueError for two paths at a time, or what is no bool."""
-    if flag(screw, "screw") & flag(linear, "linear"):
-        raise ValueError("screw and linear: objects move on one kind of path")
 
 
 class SweptBoxes:
@@ -82,15 +73,10 @@ class SweptBoxes:
 class FirstContactStage(Stage):
     """Find when the pairs first touch that do not intersect at first.
 
-    Args:
-        tolerance, screw, linear: As for `FirstContactQuery`, checked.
-
-    Attributes:
-        ends, contacts: As of `FirstContactQuery`.
-        motion: Motion of each pair, device `path.Motion` or `linear.LinearMotion` (pair,).
+    Arguments and attributes are those of `FirstContactQuery`, checked.
     """
 
-    motion: wp.array
+    motion: wp.array  # of each pair, device `path.Motion` or `linear.LinearMotion` (pair,)
     memory: wp.array  # of each thread of the CPU
 
     def __init__(self, tolerance=1e-6, screw=False, linear=False):
@@ -104,11 +90,7 @@ class FirstContactStage(Stage):
         device, batch, placed = operator.device, operator.batch, operator.batch.objects.pool
         self.contacts.counter = wp.zeros(CONTACT_COUNTERS, dtype=wp.int32, device=device)
         self.ends.rotation, self.ends.position = wp.clone(placed.rotation), wp.clone(placed.position)
-        paths = path.Paths()
-        for name in ("axis", "angle", "anchor", "start", "travel"):
-            dtype = wp.float64 if name == "angle" else wp.vec3d
-            setattr(paths, name, wp.zeros(batch.object_count, dtype=dtype, device=device))
-        self._motions.paths, self._motions.ends = paths, self.ends
+        self._motions.paths, self._motions.ends = zeros_of(path.Paths, batch.object_count, 0, device), self.ends
 
     def kernels(self, device) -> list:
         """Return what makes motions and follows them."""
@@ -171,28 +153,20 @@ class FirstContactStage(Stage):
         return [launch(group.warp_motion_search(self._kind), inputs=inputs, **threads)]
 
     def read(self, found: Found, device: bool, with_rows: bool):
-        """Read times and how motions end.
-
-        Raises:
-            ValueError: An object turns by half a revolution, which has no shortest way.
-        """
+        """Read times and how motions end; raise ValueError where an object turns by half a revolution."""
         n = len(found.pairs)
         ends = first_rows(self.contacts.end, n).numpy() if n else np.empty(0, np.int32)
         half = np.flatnonzero(ends == int(start.HALF_TURN))
         if len(half):
-            pairs = found.pairs.numpy() if device else found.pairs
-            raise ValueError(
-                f"end_poses: one of objects {pairs[half[0]].tolist()} turns by half a revolution, which has no "
-                "shortest way; split its motion in two"
-            )
-        found.time = wp.clone(first_rows(self.contacts.time, n))
-        found.clear, found.undecided = ends == int(face_pair.CLEAR), ends == int(face_pair.UNDECIDED)
-        if not device:
-            found.time = found.time.numpy()
-            return
-        found.clear, found.undecided = (
-            wp.array(answers, dtype=wp.bool, device=self.operator.device) for answers in (found.clear, found.undecided)
-        )
+            pair = (found.pairs.numpy() if device else found.pairs)[half[0]].tolist()
+            why = "turns by half a revolution, which has no shortest way; split its motion in two"
+            raise ValueError(f"end_poses: one of objects {pair} {why}")
+        time = wp.clone(first_rows(self.contacts.time, n))
+        found.time = time if device else time.numpy()
+        for name, end in (("clear", face_pair.CLEAR), ("undecided", face_pair.UNDECIDED)):
+            answers = ends == int(end)
+            answers = wp.array(answers, dtype=wp.bool, device=self.operator.device) if device else answers
+            setattr(found, name, answers)
 
 
 class FirstContactQuery(Operator):
@@ -231,31 +205,16 @@ class FirstContactQuery(Operator):
 
     @staticmethod
     def plan(tolerance=1e-6, screw=False, linear=False) -> list[Stage]:
-        """Return the stages of a query.
-
-        Raises:
-            ValueError: A tolerance out of range, or two paths at a time.
-        """
-        check_path(screw, linear)
+        """Return the stages of a query; raise ValueError for a tolerance out of range, or two paths at a time."""
+        if flag(screw, "screw") & flag(linear, "linear"):
+            raise ValueError("screw and linear: objects move on one kind of path")
         motions = FirstContactStage(check_time_tolerance(tolerance), bool(screw), bool(linear))
         return [IntersectStage(), InsideStage(), motions]
 
-    def set_pairs(self, pairs, within=None):
-        """Query other pairs from now on, in the room there is if they fit; there is no within.
-
-        Raises:
-            ValueError: Bad pairs, or a query that runs the broad phase.
-        """
-        self.ask_pairs(pairs, within=within)
-
     def set_end_poses(self, end_poses):
-        """Set where each object's motion ends, from the next launch on.
+        """Set where each object's motion ends, from the next launch on. (synchronization point)
 
-        Args:
-            end_poses: Of all objects, as for `Scene.set_poses`. (synchronization point)
-
-        Raises:
-            ValueError: As `Scene.set_poses`; nothing is changed.
+        Takes the poses of all objects, and raises ValueError, as `Scene.set_poses`; nothing is changed then.
         """
         check_device(self.device, "giving a query end poses")
         self._end_setter.set(end_poses)

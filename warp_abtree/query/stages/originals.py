@@ -14,17 +14,12 @@ from warp_abtree.state.batch import Batch
 def make_finest(batch: Batch) -> Batch:
     """Return a batch of the same objects at their finest LODs, as they are posed; their tree states are made once."""
     finest = batch.with_own_states(follows_poses=True)
-    finest.add_finest(range(len(batch.models.lod_max)))
+    finest.replace_states(list(enumerate(batch.models.lod_max.tolist())), batch.object_model)
     return finest
 
 
 class Originals:
-    """The objects of a batch at their finest LODs, as they are posed, with tree states that are made once.
-
-    Attributes:
-        batch: `Batch` of its own.
-        broad_phase: Of these; originals may lie out of the boxes of their LODs.
-    """
+    """`make_finest` of a batch, and their broad phase: originals may lie out of the boxes of their LODs."""
 
     def __init__(self, batch: Batch):
         self._of, self.batch = batch, make_finest(batch)
@@ -38,16 +33,9 @@ class Originals:
 
 
 class OriginalStage(Stage):
-    """Move contact points found at LODs to the original surfaces.
+    """Move contact points found at LODs to the original surfaces, of which `finest` is a batch; None makes one."""
 
-    Args:
-        finest: `Batch` of the originals; None makes one.
-
-    Attributes:
-        poses: Of the originals of each pair, device `PairPose` (pair,).
-    """
-
-    poses: Any
+    poses: Any  # of the originals of each pair, device `PairPose` (pair,)
 
     def __init__(self, finest: Batch | None = None):
         self.finest: Any = finest
