@@ -65,7 +65,6 @@ def load(tmp_path, text, **options):
 
 
 def load_ours(name, device, changes=(), **options):
-    """Load a scene of the project with parts of its text exchanged."""
     text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
     for old, new in changes:
         assert old in text

@@ -116,3 +116,14 @@ def posed_triangles(scene, i):
 def names_of(scene):
     """Return the names of a scene's objects."""
     return [scene.name(i) for i in range(scene.object_count)]
+
+
+def define_mesh(stage, where, points, faces):
+    """Define a mesh in a USD stage."""
+    from pxr import Gf, UsdGeom
+
+    mesh = UsdGeom.Mesh.Define(stage, where)
+    mesh.GetPointsAttr().Set([Gf.Vec3f(*map(float, v)) for v in points])
+    mesh.GetFaceVertexCountsAttr().Set([len(face) for face in faces])
+    mesh.GetFaceVertexIndicesAttr().Set(np.ravel(faces).tolist())
+    return mesh
