@@ -260,12 +260,7 @@ def test_segments_of_any_size(device, threads):
         np.testing.assert_array_equal(rows[: len(found)], in_order(found))
         assert (rows[len(found) :] == -1).all() and deferred == 0
         np.testing.assert_array_equal(start, np.append(0, np.cumsum(sizes)))
-
-
-@pytest.mark.parametrize("threads", [32, 128, 256])
-def test_pairs_of_many_tiles(device, threads):
-    """More pairs than a block has threads, most of them of few hits, the last of none."""
-    rng = np.random.default_rng(1)
+    # More pairs than a block has threads, most of them of few hits, the last of none.
     for pairs in (1, SEGMENT_THREADS, SEGMENT_THREADS + 1, 3 * SEGMENT_THREADS + 77):
         sizes = rng.integers(0, 40, pairs) * (rng.random(pairs) < 0.7)
         sizes[-1] = pairs == 1

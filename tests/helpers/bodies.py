@@ -44,6 +44,12 @@ def on_ground(device, *placed, **options):
     return make(device, (GROUND, FLOOR, True), *placed, **options)
 
 
+def heap(device, count=7, **options):
+    """Return rigid bodies that fall onto each other."""
+    poses = [(0.1 * i, 0.05 * i, 0.6 + 0.55 * i, 0, 0, 0, 1) for i in range(count)]
+    return on_ground(device, *(((BRICK, TORUS, BALL)[i % 3], pose) for i, pose in enumerate(poses)), **options)
+
+
 def bits(dynamics):
     """Return poses, velocities and angular velocities, (n, 13)."""
     return np.concatenate([dynamics.poses(), *dynamics.velocities()], axis=1)

@@ -129,3 +129,7 @@ def far_cases(rng, far):
         pose_b[:3] += 3 * rng.normal(size=3)
         cases.append((*a, pose_a + shift, *b, pose_b + shift))
     return cases
+
+
+def to_bytes(result, names=("distance", "bracket", "points", "point_faces")):
+    return [np.asarray(getattr(result, name)).tobytes() for name in names]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import trimesh
+from oracles.peers import fcl_object
 from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
@@ -148,3 +149,24 @@ def asked_pairs(robot):
 
 def pairs_of(*names):
     return {frozenset(pair.split()) for pair in names}
+
+
+class InFcl:
+    """The parts of a robot and what stands around it in FCL, and the pairs of them that are tested."""
+
+    def __init__(self, robot, around=()):
+        self.robot, mounted = robot, set(robot.mounted)
+        self.parts = [fcl_object(*model.mesh_at(model.lod_max)[:2]) for model in robot.models]
+        others = [fcl_object(*model.mesh_at(model.lod_max)[:2], pose) for model, pose in around]
+        self.pairs = [(part, b) for k, part in zip(robot.model_link, self.parts) if k not in mounted for b in others]
+        self.pairs += [(self.parts[i], self.parts[j]) for i, j in robot.pairs]
+
+    def ask(self, poses):
+        """Return whether any pair intersects at poses of links (n, 4, 4), and the least distance."""
+        import fcl
+
+        for part, matrix in zip(self.parts, poses[self.robot.model_link]):
+            part.setTransform(fcl.Transform(matrix[:3, :3], matrix[:3, 3]))
+        if any(fcl.collide(a, b) for a, b in self.pairs):
+            return True, 0.0
+        return False, min(fcl.distance(a, b, fcl.DistanceRequest(), fcl.DistanceResult()) for a, b in self.pairs)

@@ -87,15 +87,15 @@ def test_other_buffers_do_not_match(device, world):
         found.collide(state, contacts)
         assert (rows(contacts)[2] == -1).all()
         assert contacts.rigid_contact_match_generation.numpy()[0] == -1
-    for _ in range(12):  # new ones lie where those before lay
-        found.collide(state, other := found.contacts())
-        assert (rows(other)[2] == -1).all()
-        del other
     found.collide(state, first)
     assert (rows(first)[2] >= 0).all() and len(rows(first)[2]) == 4 * COUNT
     found.collide(state, plain)
     found.collide(state, first)
     assert (rows(first)[2] == -1).all()
+    for _ in range(12):  # new ones lie where those before lay
+        found.collide(state, other := found.contacts())
+        assert (rows(other)[2] == -1).all()
+        del other
 
 
 def test_a_graph_matches(device, world):

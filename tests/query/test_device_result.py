@@ -132,11 +132,7 @@ def test_nothing_to_find(device, packs):
                 assert expected.count.sum() == 0
             if output not in ("any", "count"):
                 assert expected.faces.shape == (0, 3) and expected.faces.dtype == np.int32
-    assert scene_is_asked_nothing(far)
-
-
-def scene_is_asked_nothing(scene):
-    return all(len(scene.intersect([], output, device=True).any) == 0 for output in ("any", "faces", "contacts"))
+        assert all(len(far.intersect([], output, device=True).any) == 0 for output in ("any", "faces", "contacts"))
 
 
 @pytest.mark.parametrize("keeps", [False, True], ids=["host", "device"])

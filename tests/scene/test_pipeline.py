@@ -262,11 +262,8 @@ def test_lost_work_is_told(device):
     expected = scene.intersect(output="faces")
     hits = len(expected.faces)
     scene.set_poses(far)
-    for room, pairs, message in (
-        (2 * hits, 14, "pairs=15.*for 14"),
-        (hits - 1, 15, f"hits={hits}.* for {hits - 1}"),
-        (hits, 15, None),
-    ):
+    full = (2 * hits, 14, "pairs=15.*for 14"), (hits - 1, 15, f"hits={hits}.* for {hits - 1}"), (hits, 15, None)
+    for room, pairs, message in full:
         frame = ab.Pipeline(scene, "faces", capacity=ab.Buffers(room, pairs=pairs))
         launch = scenes.replay(frame)
         for poses in (far, near, far):
