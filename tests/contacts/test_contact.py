@@ -108,7 +108,6 @@ def check_fields(result):
 
 @pytest.mark.parametrize("names", [("lattice soup", "soup"), ("twins", "twins"), ("crumbs", "torus")])
 def test_batches_in_the_world(device, names):
-    """Random poses: fields, ends and normals in the world, mirrored pairs, repeated runs."""
     rng = np.random.default_rng(3)
     models = [sample(name) for name in names]
     a, b = models
@@ -140,7 +139,6 @@ def test_batches_in_the_world(device, names):
 
 
 def test_contacts_need_no_pickle(device, tmp_path):
-    """DESIGN: structured, `pair, faces, p0, p1, ...`; what is kept on disk comes back to the bit."""
     result = contacts_of(device, (sample("ball"), STILL), (sample("torus"), CASES["flat"][2]), pairs=[(1, 0)])
     assert len(result.contacts) > 10
     assert result.contacts.dtype.names == ("pair", "faces", *VECTORS, "coplanar")

@@ -107,7 +107,6 @@ def test_divisions_are_rounded(device):
 
 
 def test_any_batch(device):
-    """A pair's contacts and their sum are the same alone, repeated and in any place."""
     scene, pairs = touching(device)
     whole, query = ab.ContactQuery(scene, pairs).run(), ab.ContactQuery(scene, pairs[:1])
     batch = np.append(np.random.default_rng(2).integers(0, len(pairs), 30), [12, 12, 0])
@@ -161,7 +160,6 @@ def test_nothing_to_find(device):
 
 
 def test_other_poses_and_distances(device):
-    """A query goes on with the poses of each launch, and proves distances beside contacts."""
     scene = in_a_row(device, "ball", (0, 1.5, 4))
     query = ab.ContactQuery(scene, [(0, 1), (1, 2), (0, 2)], within=1.0)
     first = query.run()

@@ -264,7 +264,6 @@ def test_on_the_device_and_in_float32(device):
 
 
 def test_capture_and_room(device, regime):
-    """A graph repeats; lists that are full name the demand, which is enough."""
     cases, gaps = cases_of(9, 12, 200)
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     query = ab.ContactQuery(scene, pairs, gap=gaps)
@@ -324,7 +323,6 @@ def test_bad_gaps_are_refused(device, bad):
 
 
 def test_huge_gaps_reach_everything(device, regime):
-    """Every pair of faces is nearer than a gap beyond all sizes."""
     scene = scene_with(device, box(1, 1, 1), (model_of(trimesh.creation.icosphere(1)), (3.0, 0, 0, 0, 0, 0, 1)))
     for gap in (1e3, 1e30, 1e300, 1.7e308):
         assert len(scene.intersect([(0, 1)], output="contacts", gap=gap).contacts) == 12 * 80

@@ -32,7 +32,6 @@ TILT = np.array([0.31, -0.52, 0.23, 0.76]) / np.linalg.norm([0.31, -0.52, 0.23, 
 
 
 def plain_model(vertices, faces):
-    """Return a model of one LOD."""
     return ab.Model.from_arrays(np.asarray(vertices, float), np.asarray(faces), base_faces=len(faces))
 
 

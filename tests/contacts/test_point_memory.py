@@ -299,7 +299,6 @@ def run_walk(device):
 
 
 def test_the_same_bits_on_every_device():
-    """On the CPU by warps and by threads, too."""
     found = [run_walk(str(device)) for device in wp.get_devices()]
     with testing.regime(warps=True):
         found.append(run_walk("cpu"))

@@ -230,7 +230,6 @@ def test_no_pairs_and_the_broad_phase(device):
 
 
 def test_sweeps(device):
-    """Chunks of poses, answered as objects are."""
     rng = np.random.default_rng(13)
     a, b = sample("torus"), sample("capsule")
     poses = random_poses(rng, 1100, 2.5)

@@ -22,7 +22,6 @@ SURFACES = [("torus", "soup"), ("lattice soup", "capsule"), ("crumbs", "ball"), 
 
 
 def turned_matrix(pose, axis, angle):
-    """Return the matrix of a pose, turned about its own origin."""
     turn = trimesh.transformations.rotation_matrix(angle, np.eye(3)[axis])[:3, :3]
     return to_matrix(turn @ quaternion_matrix(pose[3:]), pose[:3])
 
@@ -124,7 +123,6 @@ def test_crossing_solids_without_a_depth_have_none(device):
 
 
 def test_launches_of_every_kind_give_the_same(device):
-    """A graph, results on the device, a broad phase, pickled results and objects that are no scene."""
     cases = parted_cases(np.random.default_rng(5), [("torus", "soup"), ("box", "crumbs")] * 6)
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     result = scene.intersect(pairs, "distance")

@@ -54,7 +54,6 @@ def check(result, truth, tolerance=0.0, relative=0.0, beyond=np.inf):
 
 
 def check_points(cases, result):
-    """Nearest points lie on the original faces that are named."""
     for case, points, faces in zip(cases, result.points, result.point_faces, strict=True):
         for model, _, pose, point, face in ((*case[:3], points[0], faces[0]), (*case[3:], points[1], faces[1])):
             if face >= 0:
@@ -76,7 +75,6 @@ OPTIONS = st.fixed_dictionaries(
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1), options=OPTIONS, swapped=st.booleans())
 def test_brackets_hold_the_originals(device, seed, options, swapped):
-    """Whatever the LODs, poses and options; a second time, with tree states of the originals at hand, too."""
     cases = random_cases(np.random.default_rng(seed), 8)
     pairs = pairs_of(cases)[:, ::-1] if swapped else pairs_of(cases)
     truth = scene_of(device, finest(cases)).intersect(pairs, "distance").distance
@@ -154,7 +152,6 @@ def test_poses_lods_and_objects_change(device):
 
 
 def test_distances_of_their_own_for_each_pair(device):
-    """`beyond` of each pair, and the broad phase's pairs."""
     cases = random_cases(np.random.default_rng(5), 12)
     truth = scene_of(device, finest(cases)).intersect(pairs_of(cases), "distance").distance
     beyond = truth * np.where(np.arange(12) % 2, 0.8, 1.2)
@@ -200,7 +197,6 @@ def test_sweeps(device):
 
 
 def test_solids(device):
-    """What is inside a solid intersects it, also beside pairs that LODs decide."""
     cow, ball = sample("cow"), sample("ball")
     small = ab.Model.from_arrays(ball.mesh_at(ball.lod_max)[0] / 9, ball.mesh_at(ball.lod_max)[1])
     away = [(30, 0, 0, 0, 0, 0, 1), (60, 0, 0, 0, 0, 0, 1)]

@@ -31,7 +31,6 @@ AT_ONCE = 100  # leaf pairs that a test waits for
 
 @pytest.mark.parametrize("gap", [0.001, 0.02, 0.06])
 def test_nested_parts_equal_brute_force(gap):
-    """Both outputs, the second LODs coarser; free, touching here and there, and crossing all over."""
     cases = nested_cases(np.random.default_rng(5), gap)
     truth = [true_faces(*case) for case in cases]
     rows = np.concatenate([np.insert(faces, 0, p, 1) for p, faces in enumerate(truth)])

@@ -264,7 +264,6 @@ def descend_kernel(
 
 @pytest.mark.parametrize("names", [("torus", "torus"), ("soup", "torus"), ("torus", "soup")], ids="-".join)
 def test_descends_as_node_pair_tests_do(names):
-    """The same pairs of boxes and faces, whatever is taken at once, in any order, in little room, and at any LOD."""
     a, b = (sample(name) for name in names)
     cases = [(a, a.lod_for(fraction=0.2), STILL) * 2]
     for lods in ((a.lod_max, b.lod_max), (a.lod_for(fraction=0.3), b.lod_for(fraction=0.1)), (0, b.lod_max)):

@@ -92,7 +92,6 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_answers_are_exact(device, kind):
-    """At any power of two, and in any order of triangles and corners."""
     make, count = KINDS[kind]
     rng = np.random.default_rng(1)
     pairs = make(rng, count)

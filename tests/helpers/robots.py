@@ -65,7 +65,6 @@ AROUND = [(RING, (0, 0, 0.75, 0, 0, 0, 1)), (ROOF, (0, 0.3, 1.1, 0, 0, 0.6, 0.8)
 
 
 def write_arm(folder, text, name):
-    """Write an arm and its mesh to a folder and return its path."""
     trimesh.creation.box((0.05, 0.1, 0.04)).export(folder / "part.stl")
     path = folder / name
     path.write_text(text, encoding="utf-8")
@@ -136,13 +135,11 @@ def pose_frames(description, row) -> np.ndarray:
 
 
 def random_configurations(count, limits=LIMITS, seed=0):
-    """Return configurations within limits."""
     low, high = np.array(limits).T
     return np.random.default_rng(seed).uniform(np.maximum(low, -20), np.minimum(high, 20), (count, len(limits)))
 
 
 def asked_pairs(robot):
-    """Return the pairs of names of links that are tested."""
     names = [robot.link_names[k] for k in robot.model_link]
     return {frozenset((names[i], names[j])) for i, j in robot.pairs}
 

@@ -53,7 +53,6 @@ def random_lods(rng, lods, top):
 
 
 def replay(frame):
-    """Return a function that replays the frame's graph."""
     graph = frame.capture()
     return lambda: wp.capture_launch(graph)
 
@@ -114,12 +113,10 @@ def posed_triangles(scene, i):
 
 
 def names_of(scene):
-    """Return the names of a scene's objects."""
     return [scene.name(i) for i in range(scene.object_count)]
 
 
 def define_mesh(stage, where, points, faces):
-    """Define a mesh in a USD stage."""
     from pxr import Gf, UsdGeom
 
     mesh = UsdGeom.Mesh.Define(stage, where)

@@ -30,7 +30,6 @@ SHEET = ab.Model.from_arrays([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], nam
 
 @wp.kernel
 def parity_kernel(points: wp.array[wp.vec3d], corners: wp.array2d[wp.vec3d], parity_out: wp.array2d[wp.int32]):
-    """Crossings of the rays from a point along all axes both ways."""
     i = wp.tid()
     for k in range(6):
         ray = Ray()

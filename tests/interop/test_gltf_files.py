@@ -61,7 +61,6 @@ def read(tmp_path):
 
 @pytest.mark.parametrize("mode, indices", [(5, None), (5, [4, 0, 3, 1, 2]), (6, None), (6, [2, 3, 4, 0, 1])])
 def test_strips_and_fans(read, mode, indices):
-    """Beside triangles of another material: one object of all, wound alike."""
     rim = {"attributes": {"POSITION": 2}, "mode": mode, "material": 1}
     points, more = (RIM, []) if mode == 6 or indices else (RIM[[4, 0, 3, 1, 2]], [])
     if indices:

@@ -27,7 +27,6 @@ def pair_contacts(request, monkeypatch):
 
 
 def matrix(pose):
-    """4x4 matrix of x y z qx qy qz qw."""
     found = trimesh.transformations.quaternion_matrix([pose[6], *pose[3:6]])
     found[:3, 3] = pose[:3]
     return found

@@ -21,7 +21,6 @@ NEAR = newton.ModelBuilder.ShapeConfig(gap=0.01)
 
 
 def test_pairs_are_those_of_newton(device):
-    """Of bodies, groups, worlds, filters, joints and flags; pairs of meshes are ours, and no other."""
     rng = np.random.default_rng(1)
     builder, shapes = newton.ModelBuilder(), []
     for _ in range(3):

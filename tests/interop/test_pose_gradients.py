@@ -73,7 +73,6 @@ def test_gradcheck_and_values(device, torch, pair_distance):
 
 
 def test_matrices_and_float32(device, torch, pair_distance):
-    """Along rotation vectors about the objects' origins, the same gradients; as near as float32 for that."""
     query, poses = make_query(device)
     place = wp.device_to_torch(query.device)
     weight = torch.linspace(-1, 1, len(PAIRS), device=place, dtype=torch.float64)

@@ -134,7 +134,6 @@ def check_lod(p, lod, faces):
 
 
 def surface_points(mesh, count):
-    """Points of the surface, faces without area too: corners, edge midpoints, and random ones inside."""
     corner = mesh.vertices[np.delete(mesh.faces, mesh.dropped_faces, axis=0)]
     weight = np.random.default_rng(0).dirichlet((1, 1, 1), (max(1, count // len(corner)), len(corner)))
     inside = np.einsum("sfk,fkx->sfx", weight, corner).reshape(-1, 3)
@@ -232,7 +231,6 @@ def test_a_full_heap_loses_nothing(mesh, monkeypatch):
 
 @pytest.mark.parametrize("power", [-90, 60])
 def test_scale_changes_nothing(mesh, power):
-    """Scaling by a power of two gives the same forest and scales positions and errors to the bit."""
     scaled = SimpleNamespace(vertices=np.ldexp(mesh.vertices, power), faces=mesh.faces)
     one, other = build_progressive(mesh, base_faces=1), build_progressive(scaled, base_faces=1)
     assert_same(one, other, ("vertex_parent", "face_split", "split_start", "split_face"))

@@ -251,7 +251,6 @@ def test_bad_input(device):
 
 @pytest.mark.parametrize("path", [{}, {"screw": True}, {"linear": True}], ids=["straight", "screw", "linear"])
 def test_sweeps(device, path):
-    """Motions of B in the frame of a resting A, in chunks, as matrices too, and bad ones."""
     rng = np.random.default_rng(12)
     a, b = sample("torus"), sample("capsule")
     starts, ends = (random_poses(rng, 1500, 3.0) for _ in range(2))

@@ -182,8 +182,6 @@ def copy_bounds_kernel(lower: wp.array(dtype=wp.vec3), upper: wp.array(dtype=wp.
 
 
 class GivenBoxes:
-    """Boxes of objects as a test wants them."""
-
     def __init__(self, lower, upper, device):
         self.ends = [wp.array(end, dtype=wp.vec3, device=device) for end in (lower, upper)]
 
@@ -221,7 +219,6 @@ def test_more_pairs_than_can_be_numbered(device, search):
 
 
 def test_thousand_worlds(device):
-    """Everything overlaps everything, and only worlds keep it apart."""
     scene, worlds = ab.Scene(device), np.concatenate([1001 * np.repeat(np.arange(1000), 3), [-1, -1]])
     worlds = np.random.default_rng(3).permutation(worlds)
     for world in worlds:

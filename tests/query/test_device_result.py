@@ -34,7 +34,6 @@ def make_query(scene, output, pairs=MORE_PAIRS, **options):
 
 
 def as_host(value):
-    """Return a host array of what a result has on the device, contacts as records."""
     if not isinstance(value, dict):
         return None if value is None else value.numpy()
     columns = {name: array.numpy() for name, array in value.items()}

@@ -33,7 +33,6 @@ def arms():
 
 
 def random_edges(count, seed, part=0.15):
-    """Return short edges within limits."""
     starts, others = random_configurations(count, seed=seed), random_configurations(count, seed=(seed, 1))
     return starts, starts + part * (others - starts)
 

@@ -1,5 +1,7 @@
 """Robots of URDF and MJCF files: kinematics as yourdfpy and MuJoCo have it, pairs, meshes, and refused files."""
 
+import sys
+
 import numpy as np
 import pytest
 from helpers import refused
@@ -247,5 +249,6 @@ def test_bad_paths_and_options_are_refused(urdf, tmp_path):
 
 @pytest.mark.parametrize("name, library", [("arm.urdf", "yourdfpy"), ("arm.xml", "mujoco")])
 def test_without_the_extra_there_is_one_line(name, library, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
     said = r"^an? \w+ file needs the extra `robot`: pip install 'warp-abtree\[robot\]'$"
     refused(ImportError, said, ab.Robot.load, write_arm(tmp_path, URDF, name))

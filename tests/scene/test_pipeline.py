@@ -110,7 +110,6 @@ FRAMES = {
 @pytest.mark.parametrize("captured", [True, False])
 @pytest.mark.parametrize("case", FRAMES)
 def test_answers_are_those_of_the_scene(device, case, captured):
-    """Whatever is asked; also where objects share states in groups, or take the levels of a ladder."""
     options, scene = dict(FRAMES[case]), add_objects(device)
     request = {name: value for name, value in options.items() if name not in ("groups", "ladder")}
     group, snap = options.get("groups"), None
@@ -146,7 +145,6 @@ def test_worlds_statics_filter(device):
 
 
 def test_the_start_is_the_scene(device):
-    """Also where poses were set as matrices; and the scene stays as it was."""
     scene = add_objects(device)
     lods = tops(scene) * np.arange(len(CROWD)) // len(CROWD)
     scene.set_lods(lods)

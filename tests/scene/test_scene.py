@@ -109,7 +109,6 @@ def test_one_value_serves_all_objects_that_are_added(device):
 
 
 def test_a_query_follows_poses_and_lods(device):
-    """Launched again after every change; its answers are those of a scene made so from the start."""
     rng, hits, pairs = np.random.default_rng(4), 0, [[0, 1], [2, 0], [3, 1], [2, 3]]
     scene = add_objects(device, ["torus", "capsule", "torus", "crumbs"])
     models = [scene.models[m] for m in scene.object_model]
@@ -142,7 +141,6 @@ def test_what_is_printed_says_what_is_held(device):
 
 
 def test_names_of_a_model_may_repeat(device):
-    """Models count by identity: two models of one name are two models."""
     vertices, faces, _ = sample("box").mesh_at(sample("box").lod_max)
     twins = [ab.Model.from_arrays(vertices * s, faces, name="same") for s in (1.0, 5.0)]
     scene = scene_with(device, *twins, twins[0])

@@ -281,7 +281,6 @@ def test_a_pickled_result_holds_the_names_of_its_objects(device):
 
 
 def test_results_are_rows_with_names(device, tmp_path):
-    """Of every output, from host and device alike, and also once what they were about has changed."""
     scene, pairs, names = pair_scene(device), [(1, 2), (0, 1)], ["small ball 0", "nut, M20", "small ball 2"]
     scene.change(1, name=names[1])
     for output in ("any", "contacts", "distance", "first_contact"):

@@ -21,7 +21,6 @@ from warp_abtree.scene import sweep as pose_sweep
 
 @pytest.fixture(autouse=True)
 def kept():
-    """Sweeps that are kept, none before and after a test."""
     pose_sweep._kept.clear()
     yield pose_sweep._kept
     pose_sweep._kept.clear()
@@ -156,7 +155,6 @@ def new_model(name="box"):
 
 
 def test_a_pair_of_models_is_set_up_once(device, kept):
-    """Models, states and, for the same output, buffers."""
     a, b, poses = new_model(), new_model("torus"), mixed_poses()
     first = ab.sweep(a, b, poses, device=device)
     (posed,) = kept.values()

@@ -126,7 +126,6 @@ def test_a_full_disk_keeps_the_rows_before(tmp_path, name, room):
 
 
 def test_controllers_move_lods_from_the_coarsest(device):
-    """A budget without bounds lets all of them climb to the finest."""
     for kind in (PaperController, PredictiveController):
         scene = scene_with(device, *MODELS)
         frame = ab.Frame(scene, make_motion(), kind(scene, 1e6), clock=WorkClock())
