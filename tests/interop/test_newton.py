@@ -145,14 +145,19 @@ def test_excluded_pairs_of_many_shapes():
     assert adapter.group_pairs(np.ones(10_000, int), world) == []
 
 
-def test_other_contacts_come_first(device):
-    """Those of pairs of which one is no mesh; contacts of meshes stand behind, and replace what was there."""
+def cubes_and_a_sphere(device):
+    """Return a model of a ground plane, two mesh cubes on it, one on the other, and a sphere."""
     builder = newton.ModelBuilder()
     builder.add_ground_plane()
     for z in (0.5, 1.5):
         builder.add_shape_mesh(builder.add_body(xform=at(z=z)), mesh=newton_mesh(CUBE), cfg=Config(gap=0.01))
-    builder.add_shape_sphere(builder.add_body(xform=at(3, 0, 0.3)), radius=0.3)
-    model = builder.finalize(device=device)
+    builder.add_shape_sphere(builder.add_body(xform=at(3, 0, 0.3)), radius=0.3, cfg=Config(gap=0.01))
+    return builder.finalize(device=device)
+
+
+def test_other_contacts_come_first(device):
+    """Those of pairs of which one is no mesh; contacts of meshes stand behind, and replace what was there."""
+    model = cubes_and_a_sphere(device)
     state, found, contacts = collided(model)
     for _ in range(2):
         rows = np.stack(contact_rows(contacts, "shape0", "shape1"), 1).tolist()
@@ -167,13 +172,7 @@ def test_other_contacts_come_first(device):
 
 @pytest.mark.slow
 def test_shapes_that_are_no_meshes_are_newtons(device):
-    """Two mesh cubes, one on the other, and a sphere stand on Newton's ground plane."""
-    builder = newton.ModelBuilder()
-    builder.add_ground_plane()
-    for z in (0.5, 1.5):
-        builder.add_shape_mesh(builder.add_body(xform=at(z=z)), mesh=newton_mesh(CUBE), cfg=Config(gap=0.01))
-    builder.add_shape_sphere(builder.add_body(xform=at(3, 0, 0.3)), radius=0.3, cfg=Config(gap=0.01))
-    model = builder.finalize(device=device)
+    model = cubes_and_a_sphere(device)
     poses, contacts = settle(model, ab.NewtonContacts(model), 60)
     assert touching_shapes(contacts) == {(0, 1), (1, 2), (0, 3)}
     np.testing.assert_allclose(poses[:, 2], [0.5, 1.5, 0.3], atol=0.01)

@@ -150,7 +150,6 @@ def test_bad_input_is_named(tmp_path, monkeypatch):
         (tmp_path / "none.npy", {}, "no such file"),
         (tmp_path / "text.npy", {}, "cannot be read as .npy"),
         (tmp_path / "fortran.npy", {}, "in C order"),
-        (poses_of(), {"output": "some"}, "output 'some'"),
         (poses_of(), {"precision": "good"}, "precision 'good'"),
         (poses_of(), {"shard": 0}, "shard 0 is outside"),
     ):
