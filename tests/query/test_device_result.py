@@ -294,13 +294,10 @@ def make_scene(device):
     return scene
 
 
-@pytest.mark.parametrize("output", ["any", "count", "faces", "contacts", "contacts of float32"])
+@pytest.mark.parametrize("output", OUTPUTS)
 def test_one_thread_and_any_device(device, output):
-    options, scene = {"contact_dtype": np.float32} if output.endswith("32") else {}, make_scene("cpu")
-    if "contacts" in output:
-        query = ab.ContactQuery(scene, pairs=PAIRS, within=0.05, **options)
-    else:
-        query = ab.Query(scene, output, pairs=PAIRS, within=0.05)
+    query = make_query(make_scene("cpu"), output, PAIRS, within=0.05)
+    options = {"contact_dtype": np.float32} if output.endswith("32") else {}
     with testing.regime(cpu_threads=1):
         expected = query.run()
     found = make_scene(device).intersect(PAIRS, output.split()[0], within=0.05, **options)
