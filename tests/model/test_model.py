@@ -241,7 +241,6 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
 
 def test_lods_and_requests_of_lods_are_checked():
     model = sample("twins")
-    refused(ValueError, "base_faces", Model.from_arrays, np.eye(3), [[0, 1, 2]], base_faces=0)
     for lod in (-1, 10**6, 0.5, True, "1"):
         for call in (model.mesh_at, model.error_at, lambda lod: model.error_at(lod, side="outward")):
             refused(ValueError, f"LOD.*{lod}", call, lod)

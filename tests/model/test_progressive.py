@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from helpers import samples
+from helpers import refused, samples
 from helpers.samples import REAL_MESHES, of_trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -269,6 +269,14 @@ def test_error_is_tight(name, limit, real_mesh_path):
     for lod in lods if known else [progressive.lod_for(fraction=fraction) for fraction in (0.1, 0.01)]:
         worst = max(worst if known else 0.0, measured_error(mesh, progressive, lod))
         assert progressive.lod_error[lod] <= limit * worst
+
+
+def test_bad_input_is_refused():
+    mesh = mesh_from_arrays(*MESHES["torus"]())
+    refused(ValueError, "base_faces", build_progressive, mesh, base_faces=0)
+    progressive = build_progressive(mesh)
+    for lod in (-1, progressive.lod_max + 1, 0.5):
+        refused(ValueError, "lod", progressive.mesh_at, lod)
 
 
 def test_flat_regions_cost_nothing():
