@@ -13,6 +13,7 @@ import numpy as np
 import PIL.Image
 import pytest
 import trimesh
+from helpers.samples import SHUTTLE_SCENE
 from helpers.viewer import BODIES, SCENE, write_scene
 from helpers.viewer import run_command as run
 
@@ -195,6 +196,7 @@ CASES = [
     ("info junk.obj", "junk.obj"),
     ("info ball.obj --speed", "--speed"),
     ("info ball.obj --device cuda:99", "no device 'cuda:99'"),
+    ("build gone.obj ball.npz", "gone.obj: no such file"),
     ("build ball.obj gone/ball.npz", "no folder gone"),
     ("build ball.obj ball.txt", "must end in .npz"),
     ("build ball.obj ball.npz --base-faces 0", "--base-faces"),
@@ -243,10 +245,16 @@ CASES = [
     ("run ball.obj", "ball.obj: is no scene file, which is TOML (.toml); info, query, view and picture take meshes"),
     ("run ball.glb", "ball.glb: is no scene file, which is TOML (.toml)"),
     ("run face.npz", "face.npz: is no scene file, which is TOML (.toml)"),
+    ("run one.toml --objects 5", "count or worlds"),
     ("run scene.toml --budget soon", "'soon' is no time above 0"),
     ("run scene.toml --budget 8", "'8' has no unit; give 8ms or 8s"),
+    ("view scene.toml --budget 0.008", "'0.008' has no unit"),
     ("run scene.toml --budget 0ms", "no time above 0"),
+    ("run scene.toml --budget infs", "no time above 0"),
     ("run scene.toml --controller magic", "--controller"),
+    ("run scene.toml --controller paper", "needs a budget"),
+    ("run scene.toml --controller tolerance", "needs lod.tolerance"),
+    ("run scene.toml --controller none --budget 3ms", "holds no budget"),
     ("picture gone.toml --out out.png", "gone.toml"),
     ("picture ball.obj scene.toml --out out.png", "a scene file is looked at alone"),
     ("picture ball.obj --out x.jpg", "must end in .png"),
@@ -285,6 +293,7 @@ FILES = {
     "junk.npz": "junk",
     "torn.glb": "glTF",
     "bad.toml": "[scene]\nspeed = 3\n",
+    "one.toml": SHUTTLE_SCENE,
 }
 
 

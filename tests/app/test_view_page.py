@@ -315,7 +315,8 @@ def test_a_scene_made_in_python_is_shown(device, capsys):
 def test_what_view_refuses(device):
     refused(TypeError, "not a Scene", view, make_models()[0])
     refused(ValueError, "no object", view, ab.Scene(device))
-    refused(ValueError, "port", view, ab.Scene(device), port=-1)
+    for port in (-1, 65_536):
+        refused(ValueError, "port", view, ab.Scene(device), port=port)
 
 
 def test_a_port_that_is_taken(tmp_path, capsys):
