@@ -19,16 +19,8 @@ KERNEL_GROUPS = (
 CORE_DEPENDENCIES = {"warp", "numpy", "trimesh", "warp_abtree"}
 # What users, benchmarks among them, may import beside public names.
 OPEN = {"checks", "testing"}
-PUBLIC_MAX, FILE_LINES, FOLDER_FILES, FUNCTION_LINES, ARGUMENTS, NATIVE_LINES, SNIPPET_LINES = (
-    34,
-    400,
-    12,
-    60,
-    10,
-    200,
-    15,
-)
-NATIVE_FUNCTION_LINES = 80
+PUBLIC_MAX, FOLDER_FILES, ARGUMENTS = 34, 12, 10
+FILE_LINES, FUNCTION_LINES, SNIPPET_LINES, NATIVE_LINES, NATIVE_FUNCTION_LINES = 400, 60, 15, 200, 80
 # A function of a header or a member of its structs, as clang-format lays them out: to the brace at its own indent.
 NATIVE_FUNCTION = re.compile(
     r"^( {0,8})(?!struct |namespace |#|//|\})\S[^\n;{}]*\((?:[^;{}]|\{\})*?\)(?: const)?(?:\n? *: [^\n{]*)? \{\n"
@@ -62,7 +54,6 @@ def parse(source):
 
 @cache
 def walk(tree):
-    """Return all nodes of a tree."""
     return list(ast.walk(tree))
 
 
@@ -80,7 +71,6 @@ def imports(tree, package):
 
 
 def package_of(path):
-    """Return the dotted package of a module of warp_abtree."""
     return ".".join(path.relative_to(ROOT).parent.parts)
 
 

@@ -12,7 +12,7 @@ from helpers.samples import SHAPES, SHUTTLE_SCENE, STILL, sample
 from helpers.viewer import write_scene
 
 import warp_abtree as ab
-from warp_abtree.app import SceneError, load_scene
+from warp_abtree.app import load_scene
 from warp_abtree.app.cli.main import main
 from warp_abtree.lod.timing import WorkClock
 from warp_abtree.lod.view import Camera
@@ -30,14 +30,6 @@ def test_a_number_of_objects_is_whole_and_above_0(tmp_path):
         refused(ValueError, r"^objects [^\n]*$", load_scene, write_scene(tmp_path), device="cpu", objects=count)
     loaded = load_scene(write_scene(tmp_path), device="cpu", objects=np.int64(5))
     assert loaded.scene.object_count == 5
-
-
-def test_the_spacing_of_a_file_belongs_to_its_controller(tmp_path):
-    """The paper's controller has no spacing; given on the command line instead of the file's, it goes without."""
-    text = SCENE + '[lod]\nbudget_ms = 8\nspacing = "ratio"\n'
-    with pytest.raises(SceneError, match=r"scene\.toml: lod.spacing: "):
-        load_scene(write_scene(tmp_path, text + 'controller = "paper"\n'), device="cpu")
-    assert load_scene(write_scene(tmp_path, text), device="cpu").frame(controller="paper").run(1)
 
 
 @pytest.mark.parametrize("words", ["nosuch", "--device cpu nosuch", "query --nosuch", "--device cpu paper"], ids=str)

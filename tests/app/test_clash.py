@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from helpers import refused
 from helpers.viewer import run_command as run
+from oracles.peers import fcl_object
 from trimesh.transformations import rotation_matrix, translation_matrix
 
 import warp_abtree as ab
@@ -22,49 +23,40 @@ def pin(radius, sections=64):
 
 
 def tray(extents):
-    """A box without its lid."""
     box = trimesh.creation.box(extents)
     box.update_faces(box.face_normals[:, 2] < 0.5)
     return box
 
 
-def scene_of(device, parts, solid="closed"):
+def source_of(parts):
     source = trimesh.Scene()
     for name, (mesh, *shift) in parts.items():
         source.add_geometry(mesh, name, name, transform=translation_matrix(shift or (0, 0, 0)))
-    return ab.scene_from_trimesh(source, device=device, base_faces=10**6, solid=solid)
+    return source
 
 
-# Two parts, within, and what is true of them: kind, distance, bounds of the depth, whether faces intersect.
+def scene_of(device, parts, solid="closed"):
+    return ab.scene_from_trimesh(source_of(parts), device=device, base_faces=10**6, solid=solid)
+
+
+# Two parts, and what is true of them: kind, distance, bounds of the depth, whether faces intersect.
+ON_EDGE = CUBE.copy().apply_transform(rotation_matrix(np.pi / 4, [0, 0, 1]))
+TRAY = tray((10, 10, 10))
 BARS = (trimesh.creation.box((100, 4, 4)), 0, 0, 0), (trimesh.creation.box((3, 90, 1)), 13, 3, 0.5)
 KNOWN = {
     "press fit of 0.02": ((PLATE, 0, 0, 4), (pin(5.02),), "interference", 0, (0.0199, 0.0201), True),
     "pin with play": ((PLATE, 0, 0, 4), (pin(4.75),), "clearance", 0.25 * np.cos(np.pi / 64), (0, 0), False),
     "gap of 0.5": ((CUBE,), (CUBE, 0, 10.5, 0), "clearance", 0.5, (0, 0), False),
     "walls in contact": ((CUBE,), (CUBE, 10, 3, 1), "touching", 0, (0, 0), True),
-    "an edge on a wall": (
-        (CUBE,),
-        (CUBE.copy().apply_transform(rotation_matrix(np.pi / 4, [0, 0, 1])), 5 + 50**0.5 - 1e-9, 0, 0),
-        "touching",
-        0,
-        (0, 1e-8),
-        True,
-    ),
+    "an edge on a wall": ((CUBE,), (ON_EDGE, 5 + 50**0.5 - 1e-9, 0, 0), "touching", 0, (0, 1e-8), True),
     "pressed in by 1": ((CUBE,), (trimesh.creation.box((4, 4, 4)), 0, 0, 6), "interference", 0, (0.999, 1.001), True),
     "no corner inside": (*BARS, "interference", 0, (0.5, 2.0001), True),
     "the same twice": ((CUBE,), (CUBE,), "interference", 0, (2, 5.001), True),
     "one inside": ((CUBE,), (trimesh.creation.icosphere(2, 1.0),), "interference", 0, (4, 5), False),
-    "crossing trays": ((tray((10, 10, 10)),), (tray((3, 3, 20)),), "interference", 0, None, True),
+    "crossing trays": ((TRAY,), (tray((3, 3, 20)),), "interference", 0, None, True),
     "a sheet through a solid": ((CUBE,), (tray((90, 90, 2)), 20, -7, 0), "interference", 0, (3.5, 4.001), True),
-    "in an open tray": ((tray((10, 10, 10)),), (trimesh.creation.box((1, 1, 1)),), "clearance", 4.5, (0, 0), False),
-    "on an open tray": (
-        (tray((10, 10, 10)),),
-        (trimesh.creation.box((2, 2, 2)), 1, 0, -6),
-        "touching",
-        0,
-        (0, 0),
-        True,
-    ),
+    "in an open tray": ((TRAY,), (trimesh.creation.box((1, 1, 1)),), "clearance", 4.5, (0, 0), False),
+    "on an open tray": ((TRAY,), (trimesh.creation.box((2, 2, 2)), 1, 0, -6), "touching", 0, (0, 0), True),
 }
 
 
@@ -128,13 +120,8 @@ def test_balls_have_the_kinds_and_distances_of_fcl(device):
     scene = scene_of(device, {f"{i}": (meshes[i % 3], *centre) for i, centre in enumerate(centres)})
     found = {clash.pair: clash for clash in find_clashes(scene, within=0.4)}
     assert {clash.kind for clash in found.values()} == {"interference", "clearance"}
-    objects = []
-    for i, centre in enumerate(centres):
-        made = fcl.BVHModel()
-        made.beginModel(len(meshes[i % 3].vertices), len(meshes[i % 3].faces))
-        made.addSubModel(meshes[i % 3].vertices, meshes[i % 3].faces)
-        made.endModel()
-        objects.append(fcl.CollisionObject(made, fcl.Transform(centre)))
+    poses = np.hstack([centres, [(0, 0, 0, 1)] * 24])
+    objects = [fcl_object(meshes[i % 3].vertices, meshes[i % 3].faces, pose) for i, pose in enumerate(poses)]
     for i in range(24):
         for j in range(i + 1, 24):
             apart = fcl.distance(objects[i], objects[j], fcl.DistanceRequest(), fcl.DistanceResult())
@@ -153,11 +140,8 @@ def test_balls_have_the_kinds_and_distances_of_fcl(device):
 def assembly(tmp_path, monkeypatch):
     """Work in a folder with an assembly of a press fit, a gap of 0.5, two that touch and an open part."""
     monkeypatch.chdir(tmp_path)
-    source = trimesh.Scene()
-    parts = {"plate": (PLATE, 0, 0, 4), "pin": (pin(5.02), 0, 0, 0), "block": (CUBE, 20, 0, 14)}
-    parts |= {"lid": (CUBE, 20, 0, 24.5), "tray": (tray((9, 9, 9)), 0, 60, 0)}
-    for name, (mesh, *shift) in parts.items():
-        source.add_geometry(mesh, name, name, transform=translation_matrix(shift))
+    parts = {"plate": (PLATE, 0, 0, 4), "pin": (pin(5.02),), "block": (CUBE, 20, 0, 14)}
+    source = source_of(parts | {"lid": (CUBE, 20, 0, 24.5), "tray": (tray((9, 9, 9)), 0, 60, 0)})
     source.export("assembly.glb")
     return source
 
@@ -166,11 +150,7 @@ def test_command(assembly, capsys, device):
     words = ("clash", "assembly.glb", "--within", 2, "--csv", "out.csv", "--glb", "out.glb", "--device", device)
     shown = json.loads(run(capsys, *words, "--json", status=1)[0])
     kinds = [(row["first"], row["second"], row["kind"]) for row in shown["pairs"]]
-    assert kinds == [
-        ("plate", "pin", CLASH_KINDS[0]),
-        ("plate", "block", CLASH_KINDS[1]),
-        ("block", "lid", CLASH_KINDS[2]),
-    ]
+    assert kinds == list(zip(("plate", "plate", "block"), ("pin", "block", "lid"), CLASH_KINDS))
     assert [shown[kind] for kind in CLASH_KINDS] == [1, 1, 1] and shown["open"] == ["tray"] and shown["objects"] == 5
     assert shown["tolerance"] == pytest.approx(1e-6 * np.linalg.norm(np.ptp(assembly.bounds, axis=0)), rel=1e-6)
     with open("out.csv", newline="") as file:
@@ -193,21 +173,3 @@ def test_picture_of_clashes(assembly, capsys):
 
     run(capsys, "clash", "assembly.glb", "--picture", "out.png", "--device", "cpu", status=1)
     assert min(PIL.Image.open("out.png").size) > 100
-
-
-@pytest.mark.parametrize(
-    "words, message",
-    [
-        ("gone.glb", "gone.glb: no such file"),
-        ("one.glb", "one.glb: holds one object alone"),
-        ("assembly.glb --within -1", "--within: -1.0 is no distance of 0 or more"),
-        ("assembly.glb --tolerance nan", "--tolerance: nan is no distance of 0 or more"),
-        ("assembly.glb --csv out.txt", "out.txt: the name must end in .csv"),
-        ("assembly.glb --glb assembly.glb", "assembly.glb: is read, so it is not overwritten"),
-        ("assembly.glb --csv no/out.csv", "no/out.csv: there is no folder no"),
-    ],
-)
-def test_bad_input(assembly, capsys, words, message):
-    CUBE.export("one.glb")
-    shown, errors = run(capsys, "clash", *words.split(), "--device", "cpu", status=2)
-    assert not shown and len(errors) == 1 and message in errors[0]

@@ -30,7 +30,6 @@ ASIDE = (0.8, 0.1, -1e-3, 0.0, 0.6, 0.0, 0.8)
 
 @pytest.fixture
 def files(tmp_path, monkeypatch):
-    """Work in a folder with meshes."""
     monkeypatch.chdir(tmp_path)
     trimesh.creation.icosphere(subdivisions=2).export("ball.obj")
     trimesh.creation.torus(major_radius=1.0, minor_radius=0.3).export("ring.ply")
@@ -193,7 +192,6 @@ position = [9, 0, 0]
 
 
 def test_query_of_a_scene_file(files, capsys, device):
-    """All pairs near one another, against the library; the same of an assembly."""
     Path("balls.toml").write_text(TWO_BALLS)
     scene = ab_app.load_scene("balls.toml", device=device).scene
     ab.to_trimesh(scene).export("balls.glb")
@@ -214,28 +212,7 @@ def test_query_of_a_scene_file(files, capsys, device):
     assert re.search(r"^first +second +any +count\nleft +right +yes +\d+$", shown, re.M)
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("query ball.obj", "ball.obj: B is missing; alone stands a scene file"),
-        ("query gone.glb", "gone.glb: no such file"),
-        ("query gone.npz", "gone.npz: no such file"),
-        ("query .", ".: is a folder"),
-        ("query torn.glb", "torn.glb: cannot be read"),
-        ("query balls.toml --pose 0 0 0 0 0 0 1", "--pose: for two meshes; balls.toml says"),
-        ("query balls.toml --lod-b 0.1", "--lod-b: for two meshes; balls.toml says"),
-        ("query balls.toml --output distance --signed", "signed: no object"),
-    ],
-)
-def test_query_of_a_scene_refuses(files, capsys, words, message):
-    Path("balls.toml").write_text(TWO_BALLS)
-    Path("torn.glb").write_bytes(b"glTF")
-    shown, errors = run(capsys, *words.split(), status=2)
-    assert not shown and len(errors) == 1 and message in errors[0]
-
-
 def test_shells_complete_scenes(tmp_path, capsys):
-    """By the function of the script that is printed, names and files alike."""
     pytest.importorskip("shtab")
     with pytest.raises(SystemExit):
         cli.main(["--print-completion", "bash"])
@@ -302,7 +279,6 @@ def test_a_file_of_parts_is_said_to_be_joined(assemblies, capsys, monkeypatch):
 
 
 def test_a_file_of_parts_is_a_scene(assemblies, capsys, device):
-    """Of `run`, `view` and `picture`, where it is given alone; one of a single object stays a mesh."""
     for name, parts in assemblies.items():
         playback = open_playback([name], device)
         assert playback.title == Path(name).stem and playback.scene.object_count == parts

@@ -34,7 +34,6 @@ from atomic_write import atomic_write
 
 
 def start(script, *arguments):
-    """Start a process that runs a script, with pipes."""
     command = [sys.executable, "-c", IMPORT + script, *map(str, arguments)]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 

@@ -255,7 +255,6 @@ class Thing:
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 def test_a_signal_after_the_last_code_changes_nothing():
-    """Done is done."""
     told = run_process("--version", THING + "sys.kept = Thing()\nsys.exit(main())")
     assert told == (0, f"warp-abtree {ab.__version__}\n", "")
 

@@ -156,6 +156,31 @@ LARGE = "".join(f"[models.m{i}]\nshape = 'icosphere'\nsubdivisions = 8\n" for i 
 SWEPT = ONE + "[[lod_sweep]]\nfrom = 1\nto = 0.1\nperiod = 1\n"
 LOOK = ONE + "[camera]\neye = [0, 0, 1]\n"
 KEY = "[[camera.keys]]\ntime = 0\neye = [0, 0, 1]\ntarget = [0, 0, 0]\n"
+WINDOW = "count = {}\n[lod]\nbudget_ms = 5\nwindow = 1000\n[camera]\neye = [0, 0, 9]\ntarget = [0, 0, 0]\n"
+TWO = "count = 3\n" + ONE[len(BALL) :] + "{}\n"
+GRID = "grid = { size = [3, 1, 1], spacing = [1, 1, 1] }"
+LODS = "count = 100\nlod = [9, 8, 7, 6{}]\n"
+# Limits of a whole file: a low value of one, what may follow `ONE`, what may not, and what is said of that.
+LIMITS = {
+    "bytes": (decode, "FILE_SIZE_LIMIT", len(ONE), "", "\n", f"the file: has more than {len(ONE)} bytes"),
+    # A model takes memory once for each LOD that an object begins at, whatever the number of objects.
+    "LODs": (
+        scene_file,
+        "STATE_LIMIT",
+        240,
+        *map(LODS.format, ("", ", 5")),
+        "lod: 5 LODs of 1 models have more than 240",
+    ),
+    "window": (scene_file, "MOTION_LIMIT", 10**5, *map(WINDOW.format, (100, 101)), "lod.window: 1,000 frames of 101"),
+    "worlds": (
+        objects,
+        "OBJECT_LIMIT",
+        5,
+        *map(TWO.format, ("worlds = 2", "worlds = 3")),
+        "worlds: more than 5 objects",
+    ),
+    "grid": (objects, "OBJECT_LIMIT", 5, *map(TWO.format, ("", GRID)), r"objects\[1\].grid.size: more than 5 objects"),
+}
 
 
 @pytest.mark.parametrize(
@@ -312,43 +337,26 @@ def test_a_byte_order_mark_is_left_out(tmp_path):
     assert load_scene(path, device="cpu").scene.object_count == 1
 
 
-def test_a_file_of_any_size_is_not_read_whole(tmp_path, monkeypatch):
-    monkeypatch.setattr(decode, "FILE_SIZE_LIMIT", len(ONE))
-    load(tmp_path, ONE)
-    refused(SceneError, f"the file: has more than {len(ONE)} bytes", load, tmp_path, ONE + "\n")
+@pytest.mark.parametrize("case", LIMITS)
+def test_a_file_is_limited_as_a_whole(tmp_path, monkeypatch, case):
+    module, limit, value, good, bad, message = LIMITS[case]
+    monkeypatch.setattr(module, limit, value)
+    load(tmp_path, ONE + good)
+    refused(SceneError, message, load, tmp_path, ONE + bad)
 
 
-def test_lods_that_take_too_much_together_are_refused(tmp_path, monkeypatch):
-    """A model takes memory once for each LOD that an object begins at, whatever the number of objects."""
-    monkeypatch.setattr(scene_file, "STATE_LIMIT", 3 * 80)
-    load(tmp_path, ONE + "count = 100\nlod = [9, 8, 7, 6]\n")
-    with pytest.raises(SceneError, match=r"objects\[0\].lod: 5 LODs of 1 models have more than 240 faces together"):
-        load(tmp_path, ONE + "count = 100\nlod = [9, 8, 7, 6, 5]\n")
-
-
-def test_objects_and_frames_of_a_window_are_limited_together(tmp_path, monkeypatch):
-    text = ONE + "count = {}\n[lod]\nbudget_ms = 5\nwindow = 1000\n[camera]\neye = [0, 0, 9]\ntarget = [0, 0, 0]\n"
-    monkeypatch.setattr(scene_file, "MOTION_LIMIT", 100_000)
-    load(tmp_path, text.format(100))
-    refused(SceneError, r"lod\.window: 1,000 frames of 101 objects", load, tmp_path, text.format(101))
-
-
-def test_all_objects_of_a_file_are_limited_together(tmp_path, monkeypatch):
-    monkeypatch.setattr(objects, "OBJECT_LIMIT", 5)
-    text = ONE + "count = 3\n" + ONE[len(BALL) :]
-    load(tmp_path, text + "worlds = 2\n")
-    for more, key in (("worlds = 3\n", "worlds"), ("grid = { size = [3, 1, 1], spacing = [1, 1, 1] }", "grid.size")):
-        refused(SceneError, rf"objects\[1\].{key}: more than 5 objects in all", load, tmp_path, text + more)
-
-
+COUNTS = [{}, *({"count": [n, k]} for n, k in ((3, 3), (8, 5), (5, 8), (40, 31)))]
+SECTIONS = [{}, {"sections": 3}, {"sections": 50}]
 SIZES = {
     "box": [{}],
-    "icosphere": [{"subdivisions": 4}],
-    **{name: [{"count": [n, k]} for n, k in ((3, 3), (8, 5), (5, 8), (40, 31))] for name in ("uv_sphere", "capsule")},
-    "cylinder": [{"radius": 1, "height": 1, "sections": n} for n in (3, 50)],
-    "cone": [{"radius": 1, "height": 1, "sections": n} for n in (3, 50)],
-    "annulus": [{"r_min": 1, "r_max": 2, "height": 1, "sections": n} for n in (3, 50)],
-    "torus": [{"major_radius": 1, "minor_radius": 0.3, "major_sections": n, "minor_sections": 7} for n in (3, 50)],
+    "icosphere": [{}, {"subdivisions": 4}],
+    **dict.fromkeys(("uv_sphere", "capsule"), COUNTS),
+    **{key: [{"radius": 1, "height": 1, **n} for n in SECTIONS] for key in ("cylinder", "cone")},
+    "annulus": [{"r_min": 1, "r_max": 2, "height": 1, **n} for n in SECTIONS],
+    "torus": [
+        {"major_radius": 1, "minor_radius": 0.3, **n}
+        for n in ({}, *({"major_sections": n, "minor_sections": 7} for n in (3, 50)))
+    ],
     "knot": [{"radius": 1, "tube_radius": 0.2, "sections": [50, 7]}],
     "terrain": [{"extents": [1, 1], "cells": [30, 7], "bumps": 0, "waves": 1, "rim": 0}],
     "bolt": [{"radius": 1, "length": 3, "pitch": 0.1, "head": 3, "sections": [20, 9]}],
@@ -359,11 +367,7 @@ SIZES = {
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_faces_of_a_shape_are_known_before_it_is_made(shape):
-    """Within a bound that is not far above."""
-    make, ones = GENERATED.get(shape) or getattr(trimesh.creation, shape), SIZES[shape]
-    required = {"cylinder": {"radius": 1, "height": 1}, "cone": {"radius": 1, "height": 1}}
-    required |= {"annulus": {"r_min": 1, "r_max": 2, "height": 1}, "torus": {"major_radius": 1, "minor_radius": 0.3}}
-    defaults = [] if shape in GENERATED else [required.get(shape, {})]
-    for parameters in [*ones, *defaults]:
+    make = GENERATED.get(shape) or getattr(trimesh.creation, shape)
+    for parameters in SIZES[shape]:
         faces = len(make(**parameters).faces)
         assert faces <= FACE_BOUNDS[shape](**parameters) <= 1.5 * faces + 100

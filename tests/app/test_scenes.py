@@ -65,7 +65,6 @@ def load(tmp_path, text, **options):
 
 
 def load_ours(name, device, changes=(), **options):
-    """Load a scene of the project with parts of its text exchanged."""
     text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
     for old, new in changes:
         assert old in text
@@ -164,10 +163,11 @@ def test_camera_goes_along_its_key_points(tmp_path):
 
 
 def test_controllers_of_a_file(tmp_path):
-    loaded = load(tmp_path, STEERED.replace("tolerance = 0.02", "tolerance = 0.02, steps = 1, aim = 0.8, low = 0.5"))
+    more = 'tolerance = 0.02, spacing = "ratio", steps = 1, aim = 0.8, low = 0.5'
+    loaded = load(tmp_path, STEERED.replace("tolerance = 0.02", more))
     frame = loaded.frame()
     assert isinstance(frame.lods, ab.PredictiveController) and frame.lods.budget_ms == 4
-    assert isinstance(loaded.frame(controller="paper", budget_ms=9).lods, ab.PaperController)
+    assert isinstance(loaded.frame(controller="paper").lods, ab.PaperController), "which has no spacing"
     assert loaded.frame(budget_ms=9).lods.budget_ms == 9
     tolerant = loaded.frame(controller="tolerance")
     assert isinstance(tolerant.lods, ab.ToleranceController)

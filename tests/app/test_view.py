@@ -109,8 +109,6 @@ def test_the_camera_sees_all_points():
 
 
 class Handle:
-    """Notes what it is given."""
-
     def __init__(self, log, name, options):
         self.__dict__.update(options, log=log, name=name, gone=False)
 
@@ -212,7 +210,6 @@ def test_settings_reach_the_viewer_scene(playback):
 
 
 def test_distances_are_drawn_between_nearest_points(playback):
-    """Of pairs that are apart, as segments and numbers, at the places of the moment."""
     show = Show(playback)
     assert not len(show.show()[0].nearest) and "/distances" not in show.api.handles
     show.settings.distances = True

@@ -55,7 +55,6 @@ def page(server, device):
 
 
 def act(page, *action, seconds=0.2):
-    """Do what a user asks of a page, and let it run."""
     page._post(*action)
     page.run(seconds=seconds)
 
@@ -163,7 +162,6 @@ def make_scene(device, count=0):
 
 
 def boxes_of(objects) -> dict:
-    """Return the boxes of visibility of an `ObjectPanel` by their labels."""
     return {box.label: box for box, _ in objects._boxes}
 
 
@@ -292,7 +290,6 @@ def test_many_faces_are_opened_coarser(server, device, monkeypatch):
 
 
 def test_a_scene_made_in_python_is_shown(device, capsys):
-    """At its poses and LODs, which it has at the end, too."""
     scene = ab.Scene(device)
     (ball, ring), half = make_models(), 0.5**0.5
     poses = np.array([(0, 0, 0, 0, 0, 0, 1), (0.6, 0.1, 0, half, 0, 0, half), (9, 0, 0, 0, 0, 0, 1)])
@@ -318,7 +315,8 @@ def test_a_scene_made_in_python_is_shown(device, capsys):
 def test_what_view_refuses(device):
     refused(TypeError, "not a Scene", view, make_models()[0])
     refused(ValueError, "no object", view, ab.Scene(device))
-    refused(ValueError, "port", view, ab.Scene(device), port=-1)
+    for port in (-1, 65_536):
+        refused(ValueError, "port", view, ab.Scene(device), port=port)
 
 
 def test_a_port_that_is_taken(tmp_path, capsys):
@@ -331,7 +329,6 @@ def test_a_port_that_is_taken(tmp_path, capsys):
 
 
 def count_green(tab) -> int:
-    """Count pixels of intersecting faces of the balls."""
     pixels = np.array(PIL.Image.open(io.BytesIO(tab.screenshot())).convert("RGB")).astype(int)
     red, green, blue = pixels[:, :500].reshape(-1, 3).T
     return int(np.count_nonzero((green > 1.6 * red) & (green > 1.6 * blue) & (green > 60)))

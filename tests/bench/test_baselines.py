@@ -14,7 +14,6 @@ pytestmark = pytest.mark.slow
 
 
 def test_wp_bvh_finds_what_brute_force_finds(device):
-    """Separate boxes far above its epsilon: 12 faces each, poses without rotation."""
     box = trimesh.creation.box()
     mesh = np.asarray(box.vertices), np.asarray(box.faces, np.int32)
     poses = np.zeros((4, 7), np.float32)

@@ -18,7 +18,6 @@ PLOTS = {"budget": ["budget-rain.svg", "budget-focus.svg"], "scale": ["scale_tim
 
 
 def check_assembly(rows):
-    """The meshes may not be at hand."""
     assert rows[-1]["case"] == "hammered" and rows[-1]["steps"] == 4 and rows[-1]["tunnelled"] == 0
     for row in rows[:-1]:
         if "skipped" in row:
@@ -169,7 +168,6 @@ def check_budget(rows):
 
 
 def check_points(rows):
-    """The meshes may not be at hand."""
     if "skipped" in rows[0]:
         assert "ABTREE_MESHES" in rows[0]["skipped"]
         return
@@ -201,7 +199,6 @@ def check_gate(rows):
 
 @pytest.mark.parametrize("name", main.CASES)
 def test_case(name, device, tmp_path, monkeypatch, capsys):
-    """Every number is finite, no time or size is negative, and each case's own facts hold."""
     monkeypatch.delenv("ABTREE_MESHES", raising=False)
     monkeypatch.setattr(budget, "QUICK_FRAMES", 63)
     monkeypatch.setattr(budget, "QUICK_OBJECTS", 12)

@@ -58,7 +58,6 @@ FAULTS = {
 
 
 def test_a_wrong_answer_is_noticed(device):
-    """Of 3 pairs of knots; right answers pass."""
     scene, pairs = scene_of_pairs(device, knot_model(300), pair_poses(3, 0.2))
     for fault, message in FAULTS.items():
         result = scene.intersect(pairs, "faces")

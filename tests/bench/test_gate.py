@@ -9,8 +9,6 @@ pytestmark = pytest.mark.slow
 
 
 class Known:
-    """A tree whose answers are given."""
-
     def __init__(self, digests, ms, kernels):
         self.answers = {"list": {"digests": ["ask_a"], "times": ["a"]}, "digest": digests, "prepare": None}
         self.answers["kernels"], self.ms = {"names": ["registers"], "kernels": kernels}, ms

@@ -19,8 +19,6 @@ pytestmark = pytest.mark.slow
 
 
 class KnotFolder:
-    """Gives one small knot for every mesh, and has none of the real ones."""
-
     def __init__(self, folder=None):
         self.model = ab.Model.from_arrays(*knot(300), name="knot")
 
@@ -37,7 +35,6 @@ def context(device):
 
 
 def changed_faces(model, splits):
-    """Return the faces that the last vertex splits change."""
     starts, slices = model.progressive.split_start, model.progressive.split_face
     return np.unique(slices[starts[model.lod_max - splits] :])
 
@@ -108,7 +105,6 @@ def check_motions(rows):
 
 @pytest.mark.parametrize("name", [name for name, module in main.STUDIES.items() if module == "study"])
 def test_study(name, device, tmp_path, monkeypatch):
-    """All numbers are finite, fractions are within 0 and 1, and every table has rows with its columns."""
     pytest.importorskip("scipy")
     pytest.importorskip("fcl")
     monkeypatch.setattr(study, "ModelFolder", KnotFolder)

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-import trimesh
-from helpers.bodies import box
 from helpers.contacts import check_mirrored, check_summaries, exact_normal, lies_in_plane, unit
 from helpers.samples import SHAPES, STILL, contact_poses, sample, soup
 from helpers.scenes import scene_with
@@ -110,7 +108,6 @@ def check_fields(result):
 
 @pytest.mark.parametrize("names", [("lattice soup", "soup"), ("twins", "twins"), ("crumbs", "torus")])
 def test_batches_in_the_world(device, names):
-    """Random poses: fields, ends and normals in the world, mirrored pairs, repeated runs."""
     rng = np.random.default_rng(3)
     models = [sample(name) for name in names]
     a, b = models
@@ -142,7 +139,6 @@ def test_batches_in_the_world(device, names):
 
 
 def test_contacts_need_no_pickle(device, tmp_path):
-    """DESIGN: structured, `pair, faces, p0, p1, ...`; what is kept on disk comes back to the bit."""
     result = contacts_of(device, (sample("ball"), STILL), (sample("torus"), CASES["flat"][2]), pairs=[(1, 0)])
     assert len(result.contacts) > 10
     assert result.contacts.dtype.names == ("pair", "faces", *VECTORS, "coplanar")
@@ -200,30 +196,6 @@ def test_known_faces(device, case):
             same_way = contact["normal_a"].any() and np.allclose(contact["normal_a"], contact["normal_b"])
             wanted = (1 if same_way else sign) * np.array(normal) / np.linalg.norm(normal)
             np.testing.assert_allclose(contact["normal"], wanted, atol=1e-15 if one is FLOOR else 1e-6)
-
-
-def test_boxes(device):
-    """A unit box pressed 0.1 deep into the top of a wide one."""
-    placed = (box(4, 4, 1), STILL), (box(1, 1, 1), (0.25, 0.5, 0.9, 0, 0, 0, 1))
-    result = contacts_of(device, *placed, pairs=[(0, 1), (1, 0)])
-    for p, sign in ((0, 1), (1, -1)):
-        rows, summed = result.contacts[result.contacts["pair"] == p], result.pair_contacts[p]
-        assert np.isclose(np.linalg.norm(rows["p1"] - rows["p0"], axis=1).sum(), 4.0)
-        np.testing.assert_allclose(summed["point"], (0.25, 0.5, 0.5), atol=1e-15)
-        np.testing.assert_allclose(summed["normal"], (0, 0, sign), atol=1e-15)
-
-
-@pytest.mark.parametrize("overlap", [0.05, 1.0])
-def test_balls(device, overlap):
-    """Two unit balls: a circle, and the normal from one to the other."""
-    ball, d, axis = trimesh.creation.icosphere(subdivisions=4), 2 - overlap, np.array([0.48, 0.6, 0.64])
-    model, turned = ab.Model.from_arrays(ball.vertices, ball.faces), (0.3, 0, 0, np.sqrt(0.91))
-    result = contacts_of(device, (model, (1, 2, 3, 0, 0, 0, 1)), (model, (*((1, 2, 3) + d * axis), *turned)))
-    radius = np.linalg.norm(np.cross(result.contacts["p0"] - [1, 2, 3], axis), axis=1)
-    np.testing.assert_allclose(radius, np.sqrt(1 - d * d / 4), rtol=0.04)
-    summed = result.pair_contacts[0]
-    np.testing.assert_allclose(summed["point"], (1, 2, 3) + d / 2 * axis, atol=0.01)
-    assert summed["normal"] @ axis > 0.9999
 
 
 def test_rounded_signs_give_whole_contacts(device):

@@ -107,7 +107,6 @@ def test_divisions_are_rounded(device):
 
 
 def test_any_batch(device):
-    """A pair's contacts and their sum are the same alone, repeated and in any place."""
     scene, pairs = touching(device)
     whole, query = ab.ContactQuery(scene, pairs).run(), ab.ContactQuery(scene, pairs[:1])
     batch = np.append(np.random.default_rng(2).integers(0, len(pairs), 30), [12, 12, 0])
@@ -161,7 +160,6 @@ def test_nothing_to_find(device):
 
 
 def test_other_poses_and_distances(device):
-    """A query goes on with the poses of each launch, and proves distances beside contacts."""
     scene = in_a_row(device, "ball", (0, 1.5, 4))
     query = ab.ContactQuery(scene, [(0, 1), (1, 2), (0, 2)], within=1.0)
     first = query.run()
@@ -260,12 +258,7 @@ def test_segments_of_any_size(device, threads):
         np.testing.assert_array_equal(rows[: len(found)], in_order(found))
         assert (rows[len(found) :] == -1).all() and deferred == 0
         np.testing.assert_array_equal(start, np.append(0, np.cumsum(sizes)))
-
-
-@pytest.mark.parametrize("threads", [32, 128, 256])
-def test_pairs_of_many_tiles(device, threads):
-    """More pairs than a block has threads, most of them of few hits, the last of none."""
-    rng = np.random.default_rng(1)
+    # More pairs than a block has threads, most of them of few hits, the last of none.
     for pairs in (1, SEGMENT_THREADS, SEGMENT_THREADS + 1, 3 * SEGMENT_THREADS + 77):
         sizes = rng.integers(0, 40, pairs) * (rng.random(pairs) < 0.7)
         sizes[-1] = pairs == 1

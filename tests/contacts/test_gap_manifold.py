@@ -101,9 +101,10 @@ def test_same_bits_on_every_path(device, gap):
     assert (points["depth"] < 0).any() == (gap is not None) and (points["depth"] > 0).any()
 
 
-@pytest.mark.parametrize(
-    ("tilt", "serves"), [(0.02, True), (0.043, True), (0.045, False), (0.06, False), (0.07, False)]
-)
+SERVE = [(0.02, True), (0.043, True), (0.045, False), (0.06, False), (0.07, False)]
+
+
+@pytest.mark.parametrize(("tilt", "serves"), SERVE)
 def test_normals_serve_where_the_distance_is_nearly_along_them(device, tilt, serves):
     """Edges cross, and both faces fall away from them: the gap along either normal is the distance over a cosine."""
     height, rise = 0.1, np.tan(tilt)

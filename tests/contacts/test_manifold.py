@@ -82,7 +82,6 @@ def test_equal_boxes_in_a_stack_push_upwards(device):
 
 
 def boxes_at(*placed):
-    """Return one model of boxes (extents, place of the middle)."""
     parts = [trimesh.creation.box(extents).apply_translation(place) for extents, place in placed]
     return model_of(trimesh.util.concatenate(parts))
 
@@ -208,6 +207,8 @@ def test_points_are_as_many_as_asked_for(device, most):
     shell = ab.Model.from_arrays(cavity.vertices, cavity.faces)
     with pytest.warns(RuntimeWarning, match="inside out"):
         points = ask_points(device, (model_of(ball), STILL), (shell, STILL), gap=0.02, points=most)[1].points
+    for none in (0, 65, 2.5, "8"):
+        refused(ValueError, "points", ab.ManifoldQuery, ab.Scene(device), points=none)
     normals = points["normal"]
     assert most - 1 <= len(normals) <= most  # the last place is the deepest's, if it is deeper
     seen = (normals @ np.asarray(ball.vertices).T).max(0).min()  # cosine of the emptiest cap
@@ -275,8 +276,3 @@ def test_points_are_those_of_a_plain_choice(device, gap, most):
         np.testing.assert_allclose(result.points["point"], expected, atol=1e-9)
         counts.append(len(taken))
     assert max(counts) == most or max(counts) > 12, counts
-
-
-def test_numbers_of_points_that_are_none_are_refused(device):
-    for points in (0, 65, 2.5, "8"):
-        refused(ValueError, "points", ab.ManifoldQuery, ab.Scene(device), points=points)

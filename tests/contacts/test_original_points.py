@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from helpers import refused
 from helpers.bodies import FLOOR, about, model_of
 from helpers.scenes import scene_with
 from oracles.distance import brute_distances
@@ -101,8 +102,4 @@ def test_lods_and_poses_that_change_are_followed(device):
     scene.set_poses([FLOOR, pose])
     again = query.run().points["depth"].max()
     assert query.memory.place.numpy()[0] == 0 and again == pytest.approx(depth + 0.005, abs=1e-4)
-
-
-def test_what_originals_takes(device):
-    with pytest.raises(ValueError, match="originals"):
-        ask(device, np.array([0, 0, 1.0, 0, 0, 0, 1.0]), 1.0, originals=1)
+    refused(ValueError, "originals", ab.ManifoldQuery, scene, originals=1)

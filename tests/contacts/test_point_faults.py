@@ -1,5 +1,6 @@
 """Contact points of parallel faces: normals at heights down to rounding, all corners, and bodies that slide there."""
 
+import itertools
 from functools import cache
 
 import numpy as np
@@ -31,7 +32,6 @@ TILT = np.array([0.31, -0.52, 0.23, 0.76]) / np.linalg.norm([0.31, -0.52, 0.23, 
 
 
 def plain_model(vertices, faces):
-    """Return a model of one LOD."""
     return ab.Model.from_arrays(np.asarray(vertices, float), np.asarray(faces), base_faces=len(faces))
 
 
@@ -80,12 +80,8 @@ def places():
 
 
 def cases():
-    """Yield shape, place, whether all is tilted, and order."""
-    for name in shapes():
-        for place in places():
-            for tilted in (False, True):
-                for order in ORDERS:
-                    yield name, place, tilted, order
+    """Return (shape, place, whether all is tilted, order)."""
+    return itertools.product(shapes(), places(), (False, True), ORDERS)
 
 
 def pose_of(place, height, tilted):
@@ -101,7 +97,6 @@ def pose_of(place, height, tilted):
     return np.array([*origin, *turned])
 
 
-@cache
 def find_points(device, floor, height):
     """Return a list of the points of each case: positions and normals in the frame of the floor, the latter away from
     the floor, and depths."""
@@ -135,44 +130,24 @@ def corners_of(name, place):
     return (vertices[bottom] @ quaternion_matrix(about(UP, place[2])).T)[:, :2] + place[:2]
 
 
-def listed_faults(device, floor, height, fault_of):
-    """Return what a function says of the points of each case, where it says something, with the case."""
-    found = zip(cases(), find_points(device, floor, height), strict=True)
-    return [(*case, fault) for case, points in found if (fault := fault_of(case, *points))]
-
-
 @pytest.mark.parametrize(("floor", "height"), FLOORS_AND_HEIGHTS)
-def test_normals_are_those_of_the_floor(device, floor, height):
-    def fault_of(case, points, normals, depths):
-        if not len(normals):
-            return "no points"
-        angles = np.rad2deg(np.arctan2(np.linalg.norm(np.cross(normals, UP), axis=1), normals @ UP))
-        return f"{angles.max():.3g} degrees" if angles.max() > 1 else None
-
-    assert listed_faults(device, floor, height, fault_of) == []
-
-
-@pytest.mark.parametrize(("floor", "height"), FLOORS_AND_HEIGHTS)
-def test_every_corner_has_a_point(device, floor, height):
+def test_normals_are_the_floors_depths_minus_the_height_and_every_corner_has_a_point(device, floor, height):
     """On a floor of many faces a point stands for those within a face of it. Points lie between both surfaces."""
-
-    def fault_of(case, points, normals, depths):
+    faults = []
+    for case, (points, normals, depths) in zip(cases(), find_points(device, floor, height), strict=True):
+        angles = np.rad2deg(np.arctan2(np.linalg.norm(np.cross(normals, UP), axis=1), normals @ UP))
         corners = corners_of(*case[:2])
         away = np.linalg.norm(corners[:, None] - points[:, :2], axis=2).min(1, initial=np.inf)
-        missed = int((away > max(TOLERANCE, floor_of(floor)[1])).sum())
         high = (points[:, 2] > max(0, height) + TOLERANCE) | (points[:, 2] < min(0, height) - TOLERANCE)
-        return f"{missed} of {len(corners)} corners, {high.sum()} heights" if missed or high.any() else None
-
-    assert listed_faults(device, floor, height, fault_of) == []
-
-
-@pytest.mark.parametrize(("floor", "height"), FLOORS_AND_HEIGHTS)
-def test_depths_are_minus_the_height(device, floor, height):
-    def fault_of(case, points, normals, depths):
-        worst = np.abs(depths + height).max(initial=0)
-        return f"off by {worst:.3g}" if worst > TOLERANCE or not len(depths) else None
-
-    assert listed_faults(device, floor, height, fault_of) == []
+        found = {
+            "degrees": angles.max(initial=0) if len(normals) else np.inf,
+            "missed corners": (away > max(TOLERANCE, floor_of(floor)[1])).sum(),
+            "points beside both surfaces": high.sum(),
+            "off in depth": np.abs(depths + height).max(initial=0),
+        }
+        if found["degrees"] > 1 or found["missed corners"] or high.any() or found["off in depth"] > TOLERANCE:
+            faults.append((*case, found))
+    assert faults == []
 
 
 @cache
@@ -186,14 +161,9 @@ def track(name):
 
 def slide(device, floor, start, speed, friction, rate):
     """Return how far a cube slides along x in 2 s, and its velocity then; start is its x, height and turn about z."""
-    pose = (start[0], 0.03, 0.2 + start[1], *about(UP, start[2]))
-    bodies = make(
-        device,
-        (track(floor), STILL, True),
-        (box(0.4, 0.4, 0.4), pose),
-        friction=friction,
-        velocity=[(0, 0, 0), (speed, 0, 0)],
-    )
+    cube = box(0.4, 0.4, 0.4), (start[0], 0.03, 0.2 + start[1], *about(UP, start[2]))
+    options = {"friction": friction, "velocity": [(0, 0, 0), (speed, 0, 0)]}
+    bodies = make(device, (track(floor), STILL, True), cube, **options)
     for _ in range(2 * rate):
         bodies.step(1 / rate)
     return bodies.poses()[1][0] - start[0], bodies.velocities()[0][1]
@@ -202,14 +172,8 @@ def slide(device, floor, start, speed, friction, rate):
 @pytest.mark.parametrize("rate", [60, *slow(120, 240)])
 @pytest.mark.parametrize("floor", ["open", "closed", *slow("fine")])
 @pytest.mark.parametrize("turn", [0.0, 0.5])
-def test_a_cube_without_friction_keeps_its_speed(device, floor, rate, turn):
+def test_a_cube_keeps_its_speed_or_slides_as_far_as_friction_says(device, floor, rate, turn):
     _, velocity = slide(device, floor, (-3, 0, turn), 2, 0.0, rate)
     np.testing.assert_allclose(velocity, [2, 0, 0], atol=0.01)
-
-
-@pytest.mark.parametrize("rate", [60, *slow(120, 240)])
-@pytest.mark.parametrize("floor", ["open", "closed", *slow("fine")])
-@pytest.mark.parametrize("turn", [0.0, 0.5])
-def test_a_cube_set_down_too_high_slides_as_far_as_friction_says(device, floor, rate, turn):
-    way, _ = slide(device, floor, (-1, 1e-4, turn), 1, 0.3, rate)
+    way, _ = slide(device, floor, (-1, 1e-4, turn), 1, 0.3, rate)  # set down too high
     assert way == pytest.approx(1 / (2 * 0.3 * 9.81), abs=0.02)

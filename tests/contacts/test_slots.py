@@ -59,13 +59,9 @@ def test_no_near_contact_beats_the_winner_of_its_slot(device, name, warps):
             query.run()
         rows = scene.intersect([(0, 1)], output="contacts", gap=GAP).contacts
         facing = (np.einsum("ij,ij->i", rows["normal_a"], rows["normal_b"]) <= -0.51) & (rows["separation"] > 1e-4)
-        along = np.maximum(
-            np.abs(np.einsum("ij,ij->i", rows["normal"], rows["normal_a"])),
-            np.abs(np.einsum("ij,ij->i", rows["normal"], rows["normal_b"])),
-        )
-        ahead = np.einsum("ij,ij->i", rows["normal"], rows["normal_a"]) > 0.01
-        ahead &= np.einsum("ij,ij->i", rows["normal"], rows["normal_b"]) < -0.01
-        rows = rows[facing & (along > 0.995) & ahead]
+        along, against = (np.einsum("ij,ij->i", rows["normal"], rows[name]) for name in ("normal_a", "normal_b"))
+        near_normal = np.maximum(np.abs(along), np.abs(against)) > 0.995
+        rows = rows[facing & near_normal & (along > 0.01) & (against < -0.01)]
         slots = slots_of(query)
         key, directions = slots.key.numpy()[:ROOM], slots.directions.numpy().reshape(BINS, 3, 3).astype(float)
         weight, widths = slots.weight.numpy()[0], slots.widths.numpy()[0]

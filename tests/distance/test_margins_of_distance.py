@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from conftest import slow
-from helpers.questions import pairs_of, random_lod, scene_of, to_matrix
+from helpers.questions import pairs_of, random_lod, scene_of, to_bytes, to_matrix
 from helpers.samples import STILL, grid, random_poses, random_quaternions, sample
 from oracles.distance import mesh_distance
 from oracles.triangle import quaternion_matrix
@@ -14,9 +14,6 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.poses import ROUNDING_32
 from warp_abtree.kernels.distance.frame import PAIRS_LEAST
 from warp_abtree.kernels.distance.slab_bound import BOUND_MARGINS
-
-ANSWERS = ("distance", "bracket", "points", "point_faces")
-
 
 # Rows: corners of A and of B, B's quaternion, and how far the first corners are apart: slabs' roundings add up to 5.4
 # times u (r_a + r_b + s) for warps, to 4.2 times that on a CPU, of 45 that margins have.
@@ -39,10 +36,6 @@ ROUNDED = """
 0.31006069285811616 -1.4721559474149521 -1.1559079557234815 -0.7234266875990177
 3.7854399816146004e-08 4.116893343448102e-09 -2.540862579941426e-09
 """
-
-
-def to_bytes(result):
-    return [getattr(result, name).tobytes() for name in ANSWERS]
 
 
 def sheets(rng, roughness, far, bend, side=9):
@@ -184,9 +177,8 @@ def test_tolerances_whatever_the_search_starts_from(device):
 @pytest.mark.parametrize("case", [0, 1], ids=["warps", "threads"])
 def test_margins_of_slabs_cover_roundings_that_add_up(device, case):
     """Beside its mirror image in the origin each face is one of two, so that slabs of nodes are compared."""
-    *corners, quaternion, apart = (
-        np.array(row.split(), float) for row in ROUNDED.strip().split("\n\n")[case].split("\n")
-    )
+    rows = ROUNDED.strip().split("\n\n")[case].split("\n")
+    *corners, quaternion, apart = (np.array(row.split(), float) for row in rows)
     faces = np.reshape(corners, (2, 3, 3))
     rotation = quaternion_matrix(quaternion)
     pose = to_matrix(rotation, faces[0][0] - rotation @ faces[1][0] + apart)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.questions import pairs_of, scene_of
+from helpers.questions import scene_of
 from helpers.samples import STILL, random_poses, sample
 from oracles.peers import fcl_object
 from oracles.triangle import quaternion_matrix
@@ -51,16 +51,3 @@ def test_equals_fcl(device, names):
         again = query.run()
         for name in ("distance", "bracket", "points", "point_faces"):
             np.testing.assert_array_equal(getattr(again, name), getattr(result, name))
-
-
-@pytest.mark.slow
-def test_coarse_levels_are_answered_as_meshes_of_their_own(device):
-    model = sample("stanford-bunny")
-    lods = [model.lod_for(fraction=f) for f in (0.1, 0.01)]
-    poses = place_about(model, model, random_poses(np.random.default_rng(2), 60, 1.5))
-    cases = [(model, lods[0], STILL, model, lods[1], pose) for pose in poses]
-    meshes = [ab.Model.from_arrays(*model.mesh_at(lod)[:2], base_faces=10**6) for lod in lods]
-    others = [(meshes[0], None, STILL, meshes[1], None, pose) for pose in poses]
-    one, other = (scene_of(device, some).intersect(pairs_of(some), "distance") for some in (cases, others))
-    np.testing.assert_array_equal(one.any, other.any)
-    np.testing.assert_allclose(one.distance, other.distance, rtol=1e-13, atol=1e-15)

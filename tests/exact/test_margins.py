@@ -187,9 +187,8 @@ SIDES = """
 @wp.kernel
 def side_kernel(points: wp.array2d[wp.vec3], side_out: wp.array[int]):
     i = wp.tid()
-    side_out[i] = side_of_plane(
-        0.0, FLOAT32_UNIT, wp.matrix_from_rows(points[i, 0], points[i, 1], points[i, 2]), points[i, 3]
-    )
+    plane = wp.matrix_from_rows(points[i, 0], points[i, 1], points[i, 2])
+    side_out[i] = side_of_plane(0.0, FLOAT32_UNIT, plane, points[i, 3])
 
 
 def test_the_bound_of_determinants_covers_roundings_that_add_up(device):

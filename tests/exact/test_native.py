@@ -24,16 +24,9 @@ from warp_abtree.kernels.motion.linear import LinearMotion
 from warp_abtree.kernels.motion.path import Motion
 from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR
 
-DOUBLES = {
-    "BOUND_2D": BOUND_2D,
-    "BOUND_3D": BOUND_3D,
-    "BOUND_DOUBLE": BOUND_DOUBLE,
-    "COORDINATE_MIN": COORDINATE_MIN,
-    "RELATIVE_ERROR": RELATIVE_ERROR,
-    "SHORTEST_NORMAL": SHORTEST_NORMAL,
-    "LEAST_SEPARATION": LEAST_SEPARATION,
-    "CLOSEST": CLOSEST,
-}
+DOUBLES = {"BOUND_2D": BOUND_2D, "BOUND_3D": BOUND_3D, "BOUND_DOUBLE": BOUND_DOUBLE, "COORDINATE_MIN": COORDINATE_MIN}
+DOUBLES |= {"RELATIVE_ERROR": RELATIVE_ERROR, "SHORTEST_NORMAL": SHORTEST_NORMAL, "CLOSEST": CLOSEST}
+DOUBLES |= {"LEAST_SEPARATION": LEAST_SEPARATION}
 PASSES = ("resolve_rounded", "float64_filter", "resolve_inexact")
 # Approximate on purpose, or without arithmetic.
 OTHERS = re.compile(r"\.(collapse|heap|quadric|vertex_forest|lod|arrays|native)\b")
@@ -142,22 +135,16 @@ def reached(adjoint, found):
 
 
 MAKERS = {
-    "contacts.near_search": [lambda made: made.thread_near_search()],
-    "contacts.points": [lambda made: made.point_chooser(4)],
-    "distance.within": [
-        lambda made: made.thread_within(made.PROVED_APART),
-        lambda made: made.warp_within(made.PROVED_APART),
-    ],
-    "intersect.dual_tree": [lambda made: made.warp_traversal(int(EXACT), False)],
-    "intersect.relative_pose": [lambda made: made.relative_poses(False)],
-    "intersect.simd": [lambda made: made.thread_traversal(int(EXACT))],
-    "io.contact_results": [lambda made: made.contact_packer(wp.float64, True)],
-    "motion.group": [lambda made: made.warp_motion_search(Motion), lambda made: made.warp_motion_search(LinearMotion)],
-    "motion.search": [
-        lambda made: made.thread_motion_search(Motion),
-        lambda made: made.thread_motion_search(LinearMotion),
-    ],
-    "update.block_update": [lambda made: made.state_update(True)],
+    "contacts.near_search": lambda made: [made.thread_near_search()],
+    "contacts.points": lambda made: [made.point_chooser(4)],
+    "distance.within": lambda made: [make(made.PROVED_APART) for make in (made.thread_within, made.warp_within)],
+    "intersect.dual_tree": lambda made: [made.warp_traversal(int(EXACT), False)],
+    "intersect.relative_pose": lambda made: [made.relative_poses(False)],
+    "intersect.simd": lambda made: [made.thread_traversal(int(EXACT))],
+    "io.contact_results": lambda made: [made.contact_packer(wp.float64, True)],
+    "motion.group": lambda made: [made.warp_motion_search(kind) for kind in (Motion, LinearMotion)],
+    "motion.search": lambda made: [made.thread_motion_search(kind) for kind in (Motion, LinearMotion)],
+    "update.block_update": lambda made: [made.state_update(True)],
 }
 
 
@@ -168,7 +155,7 @@ def test_modules_name_the_headers_that_their_kernels_need():
     for name in MODULES:
         python, group = importlib.import_module(name), name.removeprefix(f"{kernels.__name__}.")
         found = [value for value in vars(python).values() if isinstance(value, wp.Kernel)]
-        found += [make(python) for make in MAKERS.get(group, ())]
+        found += MAKERS.get(group, lambda made: [])(python)
         needed = {file for file in native.BASE}
         needed |= {header_of[called(f)] for kernel in found for f in reached(kernel.adj, set()) if called(f)}
         given = [kernel.module.options["extra_build_options"] for kernel in found]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from helpers.nested import nested_cases
-from helpers.questions import pairs_of, scene_of
+from helpers.questions import pairs_of, scene_of, to_matrix
 from helpers.samples import STILL, random_poses, sample, true_faces
 
 import warp_abtree as ab
@@ -31,7 +31,6 @@ AT_ONCE = 100  # leaf pairs that a test waits for
 
 @pytest.mark.parametrize("gap", [0.001, 0.02, 0.06])
 def test_nested_parts_equal_brute_force(gap):
-    """Both outputs, the second LODs coarser; free, touching here and there, and crossing all over."""
     cases = nested_cases(np.random.default_rng(5), gap)
     truth = [true_faces(*case) for case in cases]
     rows = np.concatenate([np.insert(faces, 0, p, 1) for p, faces in enumerate(truth)])
@@ -41,9 +40,8 @@ def test_nested_parts_equal_brute_force(gap):
             scene = scene_of(CPU, cases)
             found = scene.intersect(pairs_of(cases), "faces")
             np.testing.assert_array_equal(found.faces, rows)
-            np.testing.assert_array_equal(
-                scene.intersect(pairs_of(cases), "any").any, [len(faces) > 0 for faces in truth]
-            )
+            met = scene.intersect(pairs_of(cases), "any").any
+            np.testing.assert_array_equal(met, [len(faces) > 0 for faces in truth])
             tests[plain_tests] = found.node_tests.sum(), found.triangle_tests.sum()
     assert (1.3 * np.array(tests[0]) < tests[10**9]).all(), "slabs separate what boxes do not"
 
@@ -160,9 +158,7 @@ def touching_soups(rng, count, reach):
     turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # moves no number, so that corners are shared
     for points, matrix in ((small, np.eye(3)), (large @ turn, turn)):
         model = ab.Model.from_arrays(points.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
-        pose = np.eye(4)
-        pose[:3, :3] = matrix
-        scene.add(model, pose)
+        scene.add(model, to_matrix(matrix, 0))
     query = ab.Query(scene, "faces", pairs=[(0, 1)])
     rows = query.run().faces[:, 1:]
     assert (rows[rows[:, 0] == rows[:, 1], 0] == np.arange(count)).all()

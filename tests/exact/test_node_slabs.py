@@ -57,7 +57,6 @@ def test_slabs_hold_their_faces(device, name):
 
 @pytest.mark.parametrize("gap", [0.001, 0.02, 0.06])
 def test_nested_parts_equal_brute_force(device, gap):
-    """Both outputs, the second LODs coarser and without slabs; free, touching here and there, and crossing all over."""
     cases = nested_cases(np.random.default_rng(5), gap)
     rows = np.concatenate([np.insert(true_faces(*case), 0, p, 1) for p, case in enumerate(cases)])
     tests = []

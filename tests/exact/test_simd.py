@@ -24,16 +24,8 @@ from warp_abtree.kernels.triangle.signs import SEPARATED
 
 pytestmark = pytest.mark.slow
 
-wp.set_module_options(
-    native.options(
-        "base/lanes.cuh",
-        "exact/determinant.cuh",
-        "search/descend.h",
-        "intersect/float32_filter.h",
-        "intersect/float64_filter.h",
-        "triangle/float32_filter.cuh",
-    )
-)
+HEADERS = "intersect/float32_filter.h", "intersect/float64_filter.h", "triangle/float32_filter.cuh"
+wp.set_module_options(native.options("base/lanes.cuh", "exact/determinant.cuh", "search/descend.h", *HEADERS))
 
 CPU = "cpu"
 UNTOUCHED, OVER = -77, 16  # OVER: what vector instructions may write behind a list
@@ -48,10 +40,8 @@ class Posed:
 
 def posed_faces(field, points, corners, **pose):
     """Return faces between points, which a field of the models holds, with fields of a pose."""
-    made = Posed()
-    setattr(
-        made.trees.models, field, wp.array(points, dtype=wp.vec4 if field == "vertex_near" else wp.vec4d, device=CPU)
-    )
+    made, kind = Posed(), wp.vec4 if field == "vertex_near" else wp.vec4d
+    setattr(made.trees.models, field, wp.array(points, dtype=kind, device=CPU))
     corners = np.pad(corners, ((0, 0), (0, 1))).astype(np.int32)
     made.trees.states.face_corner = wp.array(corners, dtype=wp.vec4i, device=CPU)
     for name, value in pose.items():
@@ -274,7 +264,6 @@ def descend_kernel(
 
 @pytest.mark.parametrize("names", [("torus", "torus"), ("soup", "torus"), ("torus", "soup")], ids="-".join)
 def test_descends_as_node_pair_tests_do(names):
-    """The same pairs of boxes and faces, whatever is taken at once, in any order, in little room, and at any LOD."""
     a, b = (sample(name) for name in names)
     cases = [(a, a.lod_for(fraction=0.2), STILL) * 2]
     for lods in ((a.lod_max, b.lod_max), (a.lod_for(fraction=0.3), b.lod_for(fraction=0.1)), (0, b.lod_max)):
@@ -284,11 +273,8 @@ def test_descends_as_node_pair_tests_do(names):
     ways = [(1, taken, ready) for taken in (1, 2, 7, ITEMS_AT_ONCE) for ready in (1, most)]
     full = CPU_STACK_LENGTH - descent.DEPTH_FIRST_LENGTH, ITEMS_AT_ONCE, 100  # worked off one item at a time
     for case in cases:
-        with testing.regime(small_faces=0, slabs=False):
-            query, plain = (
-                GpuQuery(scene_of(CPU, [case]), "faces", pairs=[(0, 1)]),
-                None,
-            )  # which takes items one by one
+        with testing.regime(small_faces=0, slabs=False):  # which takes items one by one
+            query = GpuQuery(scene_of(CPU, [case]), "faces", pairs=[(0, 1)])
         result, plain = query.run(), None
         for way in [*ways, full] if case is cases[0] else ways:
             stack, faces = filled(CPU_STACK_LENGTH + 64), filled(WAITING_LENGTH + 64)

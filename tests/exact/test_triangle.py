@@ -35,7 +35,6 @@ def meet(pairs, device):
 
 
 def truth(pairs):
-    """Return the exact answers for triangle pairs of one magnitude."""
     faces = np.arange(3 * len(pairs)).reshape(-1, 3)
     rows = np.tile(np.arange(len(pairs))[:, None], 2)
     return oracle.pairs_intersect(pairs[:, 0].reshape(-1, 3), faces, pairs[:, 1].reshape(-1, 3), faces, rows)
@@ -93,7 +92,6 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_answers_are_exact(device, kind):
-    """At any power of two, and in any order of triangles and corners."""
     make, count = KINDS[kind]
     rng = np.random.default_rng(1)
     pairs = make(rng, count)

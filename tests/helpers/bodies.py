@@ -44,13 +44,18 @@ def on_ground(device, *placed, **options):
     return make(device, (GROUND, FLOOR, True), *placed, **options)
 
 
+def heap(device, count=7, **options):
+    """Return rigid bodies that fall onto each other."""
+    poses = [(0.1 * i, 0.05 * i, 0.6 + 0.55 * i, 0, 0, 0, 1) for i in range(count)]
+    return on_ground(device, *(((BRICK, TORUS, BALL)[i % 3], pose) for i, pose in enumerate(poses)), **options)
+
+
 def bits(dynamics):
     """Return poses, velocities and angular velocities, (n, 13)."""
     return np.concatenate([dynamics.poses(), *dynamics.velocities()], axis=1)
 
 
 def run(dynamics, steps, dt=1 / 120):
-    """Step, and return `bits`."""
     for _ in range(steps):
         dynamics.step(dt)
     return bits(dynamics)
@@ -58,14 +63,12 @@ def run(dynamics, steps, dt=1 / 120):
 
 @cache
 def ring_and_ball():
-    """Return two models that frames move."""
     ring = trimesh.creation.torus(major_radius=0.5, minor_radius=0.15, major_sections=24, minor_sections=12)
     return ab.Model.load(ring), ab.Model.load(trimesh.creation.icosphere(subdivisions=2, radius=0.4))
 
 
 @cache
 def selection_models():
-    """Return a ring, a ball off its origin, and a box."""
     ring = trimesh.creation.torus(major_radius=0.5, minor_radius=0.2, major_sections=24, minor_sections=12)
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.4)
     ball.apply_translation([0.3, -0.2, 0.1])
@@ -90,7 +93,6 @@ def newton_mesh(shape):
 
 
 def at(x=0.0, y=0.0, z=0.0, axis=(0, 0, 1), angle=0.0):
-    """Return a place of Newton's bodies and shapes."""
     return wp.transform((x, y, z), about(axis, angle))
 
 

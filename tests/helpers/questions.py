@@ -55,12 +55,10 @@ def pairs_of(cases):
 
 
 def ask(device, cases, **options):
-    """Return the result for cases in one scene, pair p the p-th."""
     return scene_of(device, cases).intersect(pairs_of(cases), **{"output": "faces", **options})
 
 
 def in_a_row(device, name, places):
-    """Return a scene of copies of a sample at places along x."""
     scene = scene_with(device, *[(sample(name), (x, 0, 0, 0, 0, 0, 1)) for x in places])
     return scene
 
@@ -72,7 +70,6 @@ def random_lod(rng, model, most_faces):
 
 
 def random_case(rng, names, most_faces):
-    """Return a case of two samples in contact at random LODs."""
     model_a, model_b = map(sample, names)
     lods = [random_lod(rng, model, most_faces) for model in (model_a, model_b)]
     pose_a, pose_b = contact_poses(rng, model_a, lods[0], model_b, lods[1])
@@ -94,7 +91,6 @@ def coarse(name, faces=500):
 
 
 def captured(operator, *arguments):
-    """Capture a launch of an operator; return a function that replays it."""
     with wp.ScopedCapture(operator.device) as capture:
         operator.launch(*arguments)
     return lambda: wp.capture_launch(capture.graph)
@@ -110,7 +106,6 @@ def parted_cases(rng, names, faces=60, least=0.0):
 
 
 def scale_cases(cases, exponent):
-    """Return cases of ("soup", "small ball") scaled by a power of two."""
     meshes = SHAPES["soup"](), SHAPES["small ball"]()
     a, b = (ab.Model.from_arrays(np.ldexp(points, exponent), faces, base_faces=4) for points, faces in meshes)
     by = np.array([2.0**exponent] * 3 + [1] * 4)
@@ -129,3 +124,7 @@ def far_cases(rng, far):
         pose_b[:3] += 3 * rng.normal(size=3)
         cases.append((*a, pose_a + shift, *b, pose_b + shift))
     return cases
+
+
+def to_bytes(result, names=("distance", "bracket", "points", "point_faces")):
+    return [np.asarray(getattr(result, name)).tobytes() for name in names]

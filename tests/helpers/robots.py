@@ -2,6 +2,7 @@
 
 import numpy as np
 import trimesh
+from oracles.peers import fcl_object
 from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
@@ -64,7 +65,6 @@ AROUND = [(RING, (0, 0, 0.75, 0, 0, 0, 1)), (ROOF, (0, 0.3, 1.1, 0, 0, 0.6, 0.8)
 
 
 def write_arm(folder, text, name):
-    """Write an arm and its mesh to a folder and return its path."""
     trimesh.creation.box((0.05, 0.1, 0.04)).export(folder / "part.stl")
     path = folder / name
     path.write_text(text, encoding="utf-8")
@@ -135,16 +135,35 @@ def pose_frames(description, row) -> np.ndarray:
 
 
 def random_configurations(count, limits=LIMITS, seed=0):
-    """Return configurations within limits."""
     low, high = np.array(limits).T
     return np.random.default_rng(seed).uniform(np.maximum(low, -20), np.minimum(high, 20), (count, len(limits)))
 
 
 def asked_pairs(robot):
-    """Return the pairs of names of links that are tested."""
     names = [robot.link_names[k] for k in robot.model_link]
     return {frozenset((names[i], names[j])) for i, j in robot.pairs}
 
 
 def pairs_of(*names):
     return {frozenset(pair.split()) for pair in names}
+
+
+class InFcl:
+    """The parts of a robot and what stands around it in FCL, and the pairs of them that are tested."""
+
+    def __init__(self, robot, around=()):
+        self.robot, mounted = robot, set(robot.mounted)
+        self.parts = [fcl_object(*model.mesh_at(model.lod_max)[:2]) for model in robot.models]
+        others = [fcl_object(*model.mesh_at(model.lod_max)[:2], pose) for model, pose in around]
+        self.pairs = [(part, b) for k, part in zip(robot.model_link, self.parts) if k not in mounted for b in others]
+        self.pairs += [(self.parts[i], self.parts[j]) for i, j in robot.pairs]
+
+    def ask(self, poses):
+        """Return whether any pair intersects at poses of links (n, 4, 4), and the least distance."""
+        import fcl
+
+        for part, matrix in zip(self.parts, poses[self.robot.model_link]):
+            part.setTransform(fcl.Transform(matrix[:3, :3], matrix[:3, 3]))
+        if any(fcl.collide(a, b) for a, b in self.pairs):
+            return True, 0.0
+        return False, min(fcl.distance(a, b, fcl.DistanceRequest(), fcl.DistanceResult()) for a, b in self.pairs)

@@ -151,7 +151,6 @@ def stored_state(scene_models, batch, state):
 
 
 def raw_state(scene, i):
-    """Return the bytes of an object's tree state."""
     batch = scene.batch()
     return stored_state(scene.models, batch, batch.objects.state[i])
 

@@ -53,7 +53,6 @@ def random_lods(rng, lods, top):
 
 
 def replay(frame):
-    """Return a function that replays the frame's graph."""
     graph = frame.capture()
     return lambda: wp.capture_launch(graph)
 
@@ -114,5 +113,14 @@ def posed_triangles(scene, i):
 
 
 def names_of(scene):
-    """Return the names of a scene's objects."""
     return [scene.name(i) for i in range(scene.object_count)]
+
+
+def define_mesh(stage, where, points, faces):
+    from pxr import Gf, UsdGeom
+
+    mesh = UsdGeom.Mesh.Define(stage, where)
+    mesh.GetPointsAttr().Set([Gf.Vec3f(*map(float, v)) for v in points])
+    mesh.GetFaceVertexCountsAttr().Set([len(face) for face in faces])
+    mesh.GetFaceVertexIndicesAttr().Set(np.ravel(faces).tolist())
+    return mesh

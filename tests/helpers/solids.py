@@ -36,7 +36,6 @@ def voxel_mesh(cells, rng=None):
 
 
 def shell(size, wall=1):
-    """Return the cells of a hollow cube."""
     grid = np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), -1).reshape(-1, 3)
     return grid[((grid < wall) | (grid >= size - wall)).any(1)]
 
@@ -70,5 +69,4 @@ def moved(x=0.0, y=0.0, z=0.0):
 
 
 def turned(faces, chosen):
-    """Return faces of which those chosen are wound the other way."""
     return np.where(np.asarray(chosen)[:, None], faces[:, ::-1], faces)

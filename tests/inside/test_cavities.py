@@ -26,7 +26,6 @@ CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], 
 
 
 def box(size, at=(0, 0, 0)):
-    """Return a box with its lower corner somewhere, wound outwards."""
     mesh = trimesh.creation.box()
     return (mesh.vertices + 0.5) * size + at, mesh.faces
 

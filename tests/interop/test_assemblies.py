@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers import refused
-from helpers.scenes import names_of, posed_triangles
+from helpers.scenes import define_mesh, names_of, posed_triangles
 
 import warp_abtree as ab
 
@@ -20,10 +20,9 @@ SHEET = trimesh.Trimesh([[0, 0, 90], [1, 0, 90], [0, 1, 90]], [[0, 1, 2]], proce
 def assembly(**more):
     """Return a trimesh.Scene of a plate, a copy of it with arrays of its own, a pin, and more."""
     source = trimesh.Scene()
-    for name, mesh, place in (("plate", PLATE, np.eye(4)), ("spare", PLATE, PLACE), ("pin", PIN, np.eye(4))):
+    for name, mesh in {"plate": PLATE, "spare": PLATE, "pin": PIN, **more}.items():
+        place = PLACE if name == "spare" else np.eye(4)
         source.add_geometry(mesh.copy(), name, f"{name} mesh", transform=place)
-    for name, mesh in more.items():
-        source.add_geometry(mesh, name, f"{name} mesh")
     return source
 
 
@@ -41,10 +40,9 @@ def test_equal_meshes_share_a_model_whatever_their_node(tmp_path, suffix):
     models = dict(zip(names, scene.object_model))
     assert models["plate"] == models["spare"] != models["pin"] and len(scene.models) == 2
     found = {name: posed_triangles(scene, i).reshape(-1, 3) for i, name in enumerate(names)}
-    for name, corners in {"plate": PLATE.triangles, "pin": PIN.triangles}.items():
-        np.testing.assert_allclose(found[name], corners.reshape(-1, 3), atol=1e-5)
     spare = trimesh.transform_points(PLATE.triangles.reshape(-1, 3), PLACE)
-    np.testing.assert_allclose(found["spare"], spare, atol=1e-5)
+    for name, corners in {"plate": PLATE.triangles, "pin": PIN.triangles, "spare": spare}.items():
+        np.testing.assert_allclose(found[name], corners.reshape(-1, 3), atol=1e-5)
 
 
 @pytest.mark.parametrize("suffix", ["glb", "obj", "usda"])
@@ -52,14 +50,11 @@ def test_solids_are_asked_for_and_open_ones_named(tmp_path, suffix):
     path, title = tmp_path / f"assembly.{suffix}", "sheet mesh" if suffix == "obj" else "sheet"
     if suffix == "usda":
         pytest.importorskip("pxr")
-        from pxr import Usd, UsdGeom
+        from pxr import Usd
 
         stage, title = Usd.Stage.CreateNew(str(path)), "/sheet"
         for name, mesh in {"plate": PLATE, "pin": PIN, "sheet": SHEET}.items():
-            made = UsdGeom.Mesh.Define(stage, f"/{name}")
-            made.GetPointsAttr().Set(mesh.vertices.astype(np.float32))
-            made.GetFaceVertexCountsAttr().Set([3] * len(mesh.faces))
-            made.GetFaceVertexIndicesAttr().Set(mesh.faces.ravel().tolist())
+            define_mesh(stage, f"/{name}", mesh.vertices, mesh.faces)
         stage.GetRootLayer().Save()
     else:
         assembly(sheet=SHEET).export(path)
@@ -144,7 +139,6 @@ def convert_in_metres(data, file_type="step"):
 
 @pytest.mark.parametrize("converter", ["cascadio", "stand-in"])
 def test_step_is_read_in_millimetres(tmp_path, converter, monkeypatch, capfd):
-    """By cascadio where it is installed, and by a stand-in of its interface."""
     if converter == "cascadio":
         pytest.importorskip("cascadio")
     else:

@@ -43,7 +43,6 @@ SHAPES = shapes()
 
 
 def random_transform(rng, spread, real=np.float32):
-    """A rigid matrix, by default of float32 numbers, which trimesh makes of those of add_object."""
     matrix = trimesh.transformations.random_rotation_matrix(rng.random(3))
     matrix[:3, 3] = rng.uniform(-spread, spread, 3)
     return matrix.astype(real).astype(np.float64)
@@ -142,7 +141,6 @@ def test_contacts_lie_on_both_faces(device):
 
 
 def test_face_pairs_against_brute_force(device):
-    """The contacts are exactly the intersecting pairs of faces, with the indices of the meshes."""
     a, b, place = SHAPES["torus"], SHAPES["cylinder"], (0.5, 0.1, 0.02)
     ours, other = ab.CollisionManager(device), ab.CollisionManager(device)
     ours.add_object("a", a)

@@ -73,7 +73,6 @@ def test_gradcheck_and_values(device, torch, pair_distance):
 
 
 def test_matrices_and_float32(device, torch, pair_distance):
-    """Along rotation vectors about the objects' origins, the same gradients; as near as float32 for that."""
     query, poses = make_query(device)
     place = wp.device_to_torch(query.device)
     weight = torch.linspace(-1, 1, len(PAIRS), device=place, dtype=torch.float64)
@@ -112,8 +111,7 @@ def test_launches_in_between_and_other_pairs_change_nothing(device, torch, pair_
     assert torch.equal(gradient, alone) and two.requires_grad
     with torch.no_grad():
         other += 1.0
-    refused_in_place = pytest.raises(RuntimeError, match="modified by an inplace operation")
-    with refused_in_place:
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         two.sum().backward()
     query.set_pairs(np.empty((0, 2), int))
     assert pair_distance(query, first).shape == (0,)
@@ -213,14 +211,10 @@ def test_bad_input_moves_nothing(device):
     assert not tape.launches
     given = wp.array(poses, **real)
     refused(TypeError, "tape: a wp.Tape is expected", record_pair_distance, None, query, given)
-
-
-def test_poses_of_a_scene_that_has_grown(device):
-    scene = scene_with(device, *[(sample(name), {}) for name in NAMES])
+    scene = scene_with(device, *map(sample, NAMES))
     query = ab.DistanceQuery(scene, PAIRS)
     scene.add(sample("torus"))
-    given = wp.zeros((5, 7), dtype=wp.float64, device=device, requires_grad=True)
-    refused(RuntimeError, "objects were added", record_pair_distance, wp.Tape(), query, given)
+    refused(RuntimeError, "objects were added", record_pair_distance, tape, query, wp.zeros((5, 7), **real))
 
 
 def test_a_tape_of_no_pairs(device):

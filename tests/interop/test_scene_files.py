@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers import refused
-from helpers.scenes import names_of, posed_triangles, scene_with
+from helpers.scenes import define_mesh, names_of, posed_triangles, scene_with
 
 import warp_abtree as ab
 
@@ -89,16 +89,6 @@ USD_PRIMS = {
 }
 
 
-def define_mesh(stage, where, points=BOX.vertices, faces=BOX.faces):
-    from pxr import Gf, UsdGeom
-
-    mesh = UsdGeom.Mesh.Define(stage, where)
-    mesh.GetPointsAttr().Set([Gf.Vec3f(*map(float, v)) for v in points])
-    mesh.GetFaceVertexCountsAttr().Set([len(face) for face in faces])
-    mesh.GetFaceVertexIndicesAttr().Set(np.ravel(faces).tolist())
-    return mesh
-
-
 def write_usd(path):
     """Write boxes, one quad, a left-handed mesh, two instances of a prim and a point instancer."""
     from pxr import Gf, Usd, UsdGeom
@@ -106,7 +96,7 @@ def write_usd(path):
     stage = Usd.Stage.CreateNew(str(path))
 
     def define(where, faces=BOX.faces, shift=None):
-        mesh = define_mesh(stage, where, faces=faces)
+        mesh = define_mesh(stage, where, BOX.vertices, faces)
         if shift is not None:
             mesh.AddTranslateOp().Set(Gf.Vec3d(*shift))
         return mesh
@@ -152,8 +142,8 @@ def test_usd_in(tmp_path, suffix):
 
 def off_sphere(points, radius, half=0.0):
     """Return how far points lie outside a sphere, or a capsule along z of this half length."""
-    middle = np.stack([0 * points[:, 0], 0 * points[:, 0], np.clip(points[:, 2], -half, half)], 1)
-    return np.linalg.norm(points - middle, axis=1) - radius
+    axis = np.clip(points[:, 2], -half, half)
+    return np.linalg.norm(np.column_stack([points[:, :2], points[:, 2] - axis]), axis=1) - radius
 
 
 def off_cylinder(points, radius, half):
@@ -272,7 +262,7 @@ def test_usd_purposes_and_what_is_not_carried_out(tmp_path):
     stage = Usd.Stage.CreateNew(str(path))
 
     def define(where, purpose=None):
-        mesh = define_mesh(stage, where)
+        mesh = define_mesh(stage, where, BOX.vertices, BOX.faces)
         if purpose is not None:
             mesh.CreatePurposeAttr(purpose)
         return mesh

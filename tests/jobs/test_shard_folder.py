@@ -74,7 +74,6 @@ def test_a_damaged_shard_is_detected_and_computed_again(tmp_path, monkeypatch, o
 
 @pytest.mark.parametrize("output", ["count", pytest.param("contacts", marks=pytest.mark.slow)])
 def test_no_flipped_bit_changes_what_is_read(tmp_path, output):
-    """Flip a bit of some bytes: it is detected, or the byte has no meaning."""
     out = tmp_path / "out"
     run(job_of(output, count=8, shard=8), out)
     path, expected = shard_at(out, 0), read(out)
@@ -109,7 +108,6 @@ def test_a_damaged_header_allocates_no_memory(tmp_path):
 
 @pytest.mark.parametrize("place", [0, 1])
 def test_a_shard_of_another_job_is_refused(tmp_path, place):
-    """Also under the name of another range."""
     job, out = job_of(), tmp_path / "out"
     run(job, out)
     run(job_of(seed=1), tmp_path / "other")
@@ -128,7 +126,7 @@ def test_a_shard_of_another_job_is_refused(tmp_path, place):
 def test_a_shard_with_a_name_of_another_job_is_refused(tmp_path, name):
     job, out = job_of(), tmp_path / "out"
     run(job, out)
-    path = out / f"shard-{name.format(f'{0:012d}', f'{20:012d}')}"
+    path = out / f"shard-{name}"
     path.write_bytes(shard_at(out, 0).read_bytes())
     refuse(job, out, "a shard of another job", str(path))
 
@@ -314,7 +312,6 @@ def test_folders_that_are_no_jobs_are_refused(tmp_path):
     ):
         refused(ValueError, what, run, job_of(), tmp_path / out)
     refused(ValueError, r"holds no job\.json", list, read_shards(tmp_path / "full"))
-    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,6 @@ def test_answers_are_those_of_a_scene(device, tmp_path, monkeypatch, output, kin
     ],
 )
 def test_answers_are_those_of_a_call(device, tmp_path, output, options, matrices):
-    """Of all outputs that `sweep` has, in shards, of poses as quaternions or matrices, and by a command."""
     poses, ends = poses_of(), poses_of(seed=4)
     if matrices:
         poses, ends = (np.array([to_matrix(*pose_matrix(row)) for row in rows]) for rows in (poses, ends))
@@ -151,7 +150,6 @@ def test_bad_input_is_named(tmp_path, monkeypatch):
         (tmp_path / "none.npy", {}, "no such file"),
         (tmp_path / "text.npy", {}, "cannot be read as .npy"),
         (tmp_path / "fortran.npy", {}, "in C order"),
-        (poses_of(), {"output": "some"}, "output 'some'"),
         (poses_of(), {"precision": "good"}, "precision 'good'"),
         (poses_of(), {"shard": 0}, "shard 0 is outside"),
     ):
@@ -189,25 +187,17 @@ def test_answers_are_those_of_the_calls(sweep, tmp_path):
     np.testing.assert_array_equal(read(tmp_path / "half")["any"], expected)
 
 
-def test_shards_that_stay_are_counted(sweep, tmp_path):
-    words = "a.npz b.npz poses.npy --out out --shard 40"
-    for place, text, counts in ((0, None, (3, 0, 0)), (0, b"PK", (3, 2, 1)), (2, b"", (3, 2, 1))):
-        if text is not None:
-            shard_at(tmp_path / "out", place).write_bytes(text)
-        found = sweep(words)[0]
-        assert (found["shards"], found["kept"], found["damaged"]) == counts
-
-
 @pytest.mark.parametrize("output", ["any", "count", "faces", "contacts"])
-def test_intersecting_poses_are_counted(sweep, tmp_path, output):
-    """Those of shards that were there already, too, and of damaged ones once."""
+def test_shards_and_their_intersecting_poses_are_counted(sweep, tmp_path, output):
+    """Poses of shards that were there already, too, and of damaged ones once."""
     words = f"a.npz b.npz poses.npy --out out --shard 40 --output {output}"
     expected = int(ab.sweep(*pair(), poses_of(), device="cpu").sum())
     assert 0 < expected < 100
-    for damage in (False, False, True):
-        if damage:
+    for kept, damaged in ((0, 0), (3, 0), (2, 1)):
+        if damaged:
             shard_at(tmp_path / "out", 1).write_bytes(b"PK")
         found = sweep(words)[0]
+        assert (found["shards"], found["kept"], found["damaged"]) == (3, kept, damaged)
         assert (found["count"], found["intersecting"], found["unit"]) == (100, expected, "pose")
 
 

@@ -67,7 +67,6 @@ def g_printed(cases, i, importance):
 
 
 def stages(cost):
-    """Return stages that cost so much together."""
     return {"select_ms": 0.25, "refine_ms": 0.125, "move_ms": 0.125, "query_ms": cost - 1.0, "answer_ms": 0.5}
 
 
@@ -306,7 +305,6 @@ def test_view_measures_distance_motion_and_focus(device):
 
 
 def bumpy_sheet(size, height, seed):
-    """A grid of squares with bumps."""
     vertices, faces = grid(size)
     vertices += np.random.default_rng(seed).uniform(-height, height, vertices.shape)
     return SimpleNamespace(vertices=vertices, faces=faces.astype(np.int32))

@@ -138,10 +138,12 @@ def test_it_can_be_passed_by(folder, built, ball, monkeypatch):
     assert len(built) == 2 and not folder.exists()
 
 
-def test_small_models_are_not_kept(folder, built):
+def test_small_models_and_those_beyond_the_limit_are_not_kept(folder, built, ball, monkeypatch):
     for _ in range(2):
         ab.Model.load(trimesh.creation.box())
-    assert len(built) == 2 and not folder.exists()
+    monkeypatch.setattr(cache, "SIZE_LIMIT", 1000)
+    ab.Model.load(ball)
+    assert len(built) == 3 and not folder.exists()
 
 
 def test_where_the_folder_is(monkeypatch, tmp_path):
@@ -206,12 +208,6 @@ def test_the_models_used_least_recently_go_first(folder, built, ball, monkeypatc
     for path in (paths[0], ball):
         ab.Model.load(path)
     assert built == [] and len(list(folder.iterdir())) == 2
-
-
-def test_a_model_beyond_the_limit_is_not_kept(folder, built, ball, monkeypatch):
-    monkeypatch.setattr(cache, "SIZE_LIMIT", 1000)
-    ab.Model.load(ball)
-    assert not folder.exists()
 
 
 def test_files_of_other_programs_stay(folder, ball):

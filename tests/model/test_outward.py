@@ -70,18 +70,15 @@ def models(draw):
     """Soups with repeated and degenerate faces, crumbs, flat grids and balls, out of shape and far from the origin."""
     seed = draw(st.integers(0, 2**32 - 1))
     rng = np.random.default_rng(seed)
-    make, largest = draw(
-        st.sampled_from(
-            [
-                (lambda count: soup(count, seed), 60),
-                (lambda count: soup(count, seed, lattice=2 + count % 3), 60),
-                (lambda count: crumbs(count, seed), 15),
-                (grid, 6),
-                (lambda _: of_trimesh(trimesh.creation.icosphere(1)), 1),
-                (square_comb, 5),
-            ]
-        )
-    )
+    kinds = [
+        (lambda count: soup(count, seed), 60),
+        (lambda count: soup(count, seed, lattice=2 + count % 3), 60),
+        (lambda count: crumbs(count, seed), 15),
+        (grid, 6),
+        (lambda _: of_trimesh(trimesh.creation.icosphere(1)), 1),
+        (square_comb, 5),
+    ]
+    make, largest = draw(st.sampled_from(kinds))
     vertices, faces = make(draw(st.integers(1, largest)))
     if draw(st.booleans()):
         vertices = vertices + draw(st.sampled_from([1e-12, 1e-3, 0.3])) * rng.normal(size=vertices.shape)

@@ -172,9 +172,8 @@ def test_strips_are_wound_alike(tmp_path):
     mesh = load_mesh(tmp_path / "a.ply")
     assert mesh.faces.tolist() == np.searchsorted([0, 1, 2, 5, 6, 7], expected).tolist()
     pytest.importorskip("collada")
-    (tmp_path / "a.dae").write_bytes(
-        dae(LETTER, f'<tristrips count="2">{INPUT}<p>7 0 6 1</p><p>1 2 6 5</p></tristrips>')
-    )
+    strips = f'<tristrips count="2">{INPUT}<p>7 0 6 1</p><p>1 2 6 5</p></tristrips>'
+    (tmp_path / "a.dae").write_bytes(dae(LETTER, strips))
     mesh = load_mesh(tmp_path / "a.dae")
     areas = np.cross(*np.diff(mesh.vertices[mesh.faces], axis=1).transpose(1, 0, 2))[:, 2]
     true = np.array(LETTER)[np.array(expected)]
@@ -240,11 +239,7 @@ MARKED = {kind: text.encode() for kind, text in MARKED.items()} | {"ply": BOX.ex
         ("a.zip", zipped(b"", "b.txt"), "holds no mesh file"),
         ("a.3mf", zipped(LATTICE, "3D/3dmodel.model"), "requires the 3MF extension http://x/beamlattice/2017/02"),
         ("a.obj", b"o a\n" + obj(LETTER, [[0, 1, 8]]), "face 0 refers to vertex 8"),
-        (
-            "a.obj",
-            obj(LETTER, []) + b"surf 0 1 0 1 1 2 3 4\nl 1 2\n",
-            r"no faces \(left out free-form surfaces, lines\)",
-        ),
+        ("a.obj", obj(LETTER, []) + b"surf 0 1 0 1 1 2 3 4\nl 1 2\n", r"\(left out free-form surfaces, lines\)"),
         ("a.step", b"ISO-10303-21;", "pip install cascadio"),
         ("a.usda", b"#usda 1.0", "read by scene_from_file"),
     ],
@@ -358,5 +353,5 @@ def test_declared_sizes_are_checked_before_arrays_are_made(tmp_path):
                 header = {"descr": "<i4", "fortran_order": False, "shape": (10**6,)}
                 np.lib.format.write_array_header_1_0(file, header)
             archive.writestr(f"{key}.npy", file.getvalue())
-    with pytest.raises(ab.ModelError, match=r"member 'vertex_parent\.npy' has another length than its array"):
-        ab.Model.open(tmp_path / "b.npz")
+    said = r"member 'vertex_parent\.npy' has another length than its array"
+    refused(ab.ModelError, said, ab.Model.open, tmp_path / "b.npz")

@@ -134,7 +134,6 @@ def check_lod(p, lod, faces):
 
 
 def surface_points(mesh, count):
-    """Points of the surface, faces without area too: corners, edge midpoints, and random ones inside."""
     corner = mesh.vertices[np.delete(mesh.faces, mesh.dropped_faces, axis=0)]
     weight = np.random.default_rng(0).dirichlet((1, 1, 1), (max(1, count // len(corner)), len(corner)))
     inside = np.einsum("sfk,fkx->sfx", weight, corner).reshape(-1, 3)
@@ -196,10 +195,8 @@ def test_base_prefix(mesh):
 
 def test_components_go_last_and_smallest_first():
     progressive = build_progressive(mesh_from_arrays(*samples.crumbs(30)), base_faces=1)
-    components = [
-        describe_mesh(mesh_from_arrays(*progressive.mesh_at(lod)[:2]))["components"]
-        for lod in range(progressive.lod_max + 1)
-    ]
+    meshes = [mesh_from_arrays(*progressive.mesh_at(lod)[:2]) for lod in range(progressive.lod_max + 1)]
+    components = [describe_mesh(mesh)["components"] for mesh in meshes]
     assert components[0] == 1 and components[-1] == 30
     falls = np.flatnonzero(np.diff(components))
     assert np.array_equal(falls, np.arange(len(falls))), "a component went before an ordinary merge"
@@ -234,7 +231,6 @@ def test_a_full_heap_loses_nothing(mesh, monkeypatch):
 
 @pytest.mark.parametrize("power", [-90, 60])
 def test_scale_changes_nothing(mesh, power):
-    """Scaling by a power of two gives the same forest and scales positions and errors to the bit."""
     scaled = SimpleNamespace(vertices=np.ldexp(mesh.vertices, power), faces=mesh.faces)
     one, other = build_progressive(mesh, base_faces=1), build_progressive(scaled, base_faces=1)
     assert_same(one, other, ("vertex_parent", "face_split", "split_start", "split_face"))
@@ -275,18 +271,18 @@ def test_error_is_tight(name, limit, real_mesh_path):
         assert progressive.lod_error[lod] <= limit * worst
 
 
-def test_flat_regions_cost_nothing():
-    for name, count in (("box", 12), ("flat grid", 2)):
-        progressive = build_progressive(mesh_from_arrays(*MESHES[name]()), base_faces=count)
-        assert progressive.lod_error[progressive.lod_for(fraction=count / progressive.face_count)] < 1e-6, name
-
-
 def test_bad_input_is_refused():
     mesh = mesh_from_arrays(*MESHES["torus"]())
     refused(ValueError, "base_faces", build_progressive, mesh, base_faces=0)
     progressive = build_progressive(mesh)
     for lod in (-1, progressive.lod_max + 1, 0.5):
         refused(ValueError, "lod", progressive.mesh_at, lod)
+
+
+def test_flat_regions_cost_nothing():
+    for name, count in (("box", 12), ("flat grid", 2)):
+        progressive = build_progressive(mesh_from_arrays(*MESHES[name]()), base_faces=count)
+        assert progressive.lod_error[progressive.lod_for(fraction=count / progressive.face_count)] < 1e-6, name
 
 
 @pytest.mark.parametrize("name", REAL_MESHES)

@@ -60,9 +60,8 @@ class Walker:
         if (m, lod) not in self.truth:
             mesh = plain(self.models[m])
             flat = oracle.active_build(mesh, lod).flat()
-            corner = [
-                mesh.corners(f, lod) if mesh.is_active(f, lod) else [-1] * 3 for f in range(len(mesh.face_vertex))
-            ]
+            faces = range(len(mesh.face_vertex))
+            corner = [mesh.corners(f, lod) if mesh.is_active(f, lod) else [-1] * 3 for f in faces]
             state = {"lod": lod, "status": flat["status"].astype(np.int32), "corner": np.array(corner, corner_type)}
             self.truth[m, lod] = state | {name: flat[name] for name in ("lower", "upper", "skip")}
         return self.truth[m, lod]

@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from helpers.motions import FAMILIES, random_boxes, skewed_boxes
 from helpers.questions import launch
+from helpers.scenes import scene_with
 from oracles.path import HAS_LONG, LONG, apply, invert
 
 import warp_abtree as ab
@@ -62,9 +63,7 @@ class Case:
     """
 
     def __init__(self, rng, device, models, starts, ends):
-        scene = ab.Scene(device)
-        for model, pose in zip(models, starts, strict=True):
-            scene.add(model, pose)
+        scene = scene_with(device, *zip(models, starts, strict=True))
         query = ab.FirstContactQuery(scene, ends, np.arange(len(models)).reshape(-1, 2), linear=True)
         self.times, trees = rng.uniform(size=len(models) // 2), query.batch.trees
         self.view = launch(view_kernel, device, len(self.times), query.ends, trees, self.times)
@@ -88,10 +87,7 @@ class Case:
         motion, t = self.view["motion"], self.times.astype(LONG)[:, None, None]
         ways = [apply(motion[f"way_{x}"], c) + motion[f"shift_{x}"][:, None] for x, c in zip("ab", self.corners)]
         starts = self.corners[0], apply(motion["first"], self.corners[1]) + motion["offset"][:, None]
-        for true, said in (
-            (self.places, [start + t * way for start, way in zip(starts, ways)]),
-            (self.ways, ways),
-        ):
+        for true, said in zip((self.places, self.ways), ([s + t * way for s, way in zip(starts, ways)], ways)):
             far = [np.sqrt(((x - y) ** 2).sum(-1)).max(-1).astype(float) for x, y in zip(true, said)]
             yield far[0] + far[1]
 

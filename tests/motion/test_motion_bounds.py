@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 from helpers.motions import FAMILIES, random_boxes, skewed_boxes
 from helpers.questions import launch
+from helpers.scenes import scene_with
 from oracles.path import HAS_LONG, LONG, apply, frames_at, move, seen_from, shortest_turns
 from scipy.spatial.transform import Rotation
 
@@ -71,9 +72,7 @@ class Case:
     """
 
     def __init__(self, rng, device, models, starts, ends, screw=False, turns=None):
-        scene = ab.Scene(device)
-        for model, pose in zip(models, starts, strict=True):
-            scene.add(model, pose)
+        scene = scene_with(device, *zip(models, starts, strict=True))
         query, count = ab.FirstContactQuery(scene, ends, np.arange(len(models)).reshape(-1, 2)), len(models)
         trees, paths = query.batch.trees, Paths()
         for name in ("axis", "angle", "anchor", "start", "travel"):
@@ -210,9 +209,8 @@ def test_no_term_of_accelerations_is_too_large(device, way, turns, seen):
 def test_swept_boxes_hold_objects_all_the_way(device, name, path):
     rng = np.random.default_rng(6)
     models, starts, ends = random_boxes(rng, COUNT, name)
-    scene = ab.Scene(device)
-    for k, (model, pose) in enumerate(zip(models, starts, strict=True)):
-        scene.add(model, pose, world=k)
+    worlds = [{"world": k} for k in range(len(models))]
+    scene = scene_with(device, *zip(models, starts, worlds, strict=True))
     query = ab.FirstContactQuery(scene, ends, **path)
     query.run()
     lower, upper = (rows.numpy() for rows in (query.broad_phase.lower, query.broad_phase.upper))
@@ -223,16 +221,12 @@ def test_swept_boxes_hold_objects_all_the_way(device, name, path):
         anchor, start, way = screw_of(pool.rotation.numpy(), *turns, start, way)
     for t in np.linspace(0, 1, 33):
         if path.get("linear"):
-            first, last = (
-                apply(r.numpy(), corners) + p.numpy().astype(LONG)[:, None]
-                for r, p in ((pool.rotation, pool.position), (query.ends.rotation, query.ends.position))
-            )
+            pools = pool, query.ends
+            first, last = (apply(p.rotation.numpy(), corners) + p.position.numpy().astype(LONG)[:, None] for p in pools)
             points = (1 - t) * first + t * last
         else:
-            anchors = anchor if path.get("screw") else still
-            points = move(
-                frames_at(pool.rotation.numpy(), *turns, anchors, start, way, np.full(2 * COUNT, t))[0], corners
-            )
+            anchors, times = anchor if path.get("screw") else still, np.full(2 * COUNT, t)
+            points = move(frames_at(pool.rotation.numpy(), *turns, anchors, start, way, times)[0], corners)
         assert (lower <= points.min(1)).all() and (points.max(1) <= upper).all(), t
 
 

@@ -37,11 +37,10 @@ def float64_step_kernel(x: wp.array2d(dtype=wp.float64), out: wp.array2d(dtype=w
     out[i, 1] = time_after(x[i, 3], x[i, 4])
 
 
-@pytest.mark.parametrize(
-    ("kernel", "real", "off"),
-    [(float32_step_kernel, np.float32, 2.0**-21), (float64_step_kernel, np.float64, 0)],
-    ids=["float32", "float64"],
-)
+STEPS = (float32_step_kernel, np.float32, 2.0**-21), (float64_step_kernel, np.float64, 0)
+
+
+@pytest.mark.parametrize(("kernel", "real", "off"), STEPS, ids=["float32", "float64"])
 def test_no_step_is_too_long(device, kernel, real, off):
     """A gap is still open where a step ends, and a time is not after what it sums, of a step that may be off."""
     rng = np.random.default_rng(1)
@@ -118,10 +117,8 @@ def test_steps_of_faces_leave_room_for_all_that_they_may_be_off(device):
         gaps = (row["mover"] @ row["rotation"].T + row["shift"]) @ n - top
         rates = (row["mover"] @ row["spin"].T + row["speed"]) @ n
         bends = row["bend"][0] * np.full(3, np.linalg.norm(row["mover"][:, :2], axis=1).max()) + row["bend"][1]
-        for step, rate, bend in (
-            (bent, rates - row["speed_slack"], bends),
-            (straight, rates - row["slack"], 0 * bends),
-        ):
+        slower = rates - row["speed_slack"], rates - row["slack"]
+        for step, rate, bend in zip((bent, straight), slower, (bends, 0 * bends)):
             times = [step_in(*terms) for terms in zip(gaps, rate, bend)]
             assert step == pytest.approx(min(times), rel=1e-10)
 
@@ -143,8 +140,8 @@ def test_contacts_are_not_late_where_float64_rounds_much(device, far, size, line
     for k in range(24):
         a, b = (size * (rng.normal(size=(1, 1, 3)) + rng.normal(size=(2, 3, 3))) for _ in range(2))
         off = far * rng.normal(size=(2, 3)) * (k % 2)
-        models = [ab.Model.from_arrays((s + x).reshape(-1, 3), np.arange(6).reshape(-1, 3), base_faces=2)
-                  for s, x in zip((a, b), off)]  # fmt: skip
+        placed = [(s + x).reshape(-1, 3) for s, x in zip((a, b), off)]
+        models = [ab.Model.from_arrays(points, np.arange(6).reshape(-1, 3), base_faces=2) for points in placed]
         still, start = np.array(STILL), np.array(STILL)
         still[:3] = far * rng.normal(size=3) - off[0]
         way = size * rng.normal(size=3)

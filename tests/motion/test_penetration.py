@@ -45,18 +45,17 @@ def block(*sizes, about=(0, 0, 0)):
     return ab.Model.from_arrays(mesh.vertices + about, mesh.faces, base_faces=12)
 
 
+KNOWN = {
+    "pin through a plate": ((12, 12, 1), (1, 1, 10), (0, 0, 0), 5.5),
+    "crossing bars": ((6, 1, 1), (1, 6, 0.6), (0, 0, 0), 0.8),
+    "press fit": ((1, 1, 1), (0.5, 0.5, 0.5), (0.1, 0.2, 0.73), 0.02),
+    "nested": ((4, 4, 4), (1, 1, 1), (0.5, 0, 0), (0, 2.0)),  # as surfaces, and as solids
+    "apart": ((4, 4, 4), (1, 1, 1), (3, 0, 0), 0),
+}
+
+
 @pytest.mark.parametrize("solid", [False, True])
-@pytest.mark.parametrize(
-    ("first", "second", "offset", "truth"),
-    [
-        ((12, 12, 1), (1, 1, 10), (0, 0, 0), 5.5),
-        ((6, 1, 1), (1, 6, 0.6), (0, 0, 0), 0.8),
-        ((1, 1, 1), (0.5, 0.5, 0.5), (0.1, 0.2, 0.73), 0.02),
-        ((4, 4, 4), (1, 1, 1), (0.5, 0, 0), (0, 2.0)),
-        ((4, 4, 4), (1, 1, 1), (3, 0, 0), 0),
-    ],
-    ids=["pin through a plate", "crossing bars", "press fit", "nested", "apart"],
-)
+@pytest.mark.parametrize(("first", "second", "offset", "truth"), KNOWN.values(), ids=KNOWN)
 def test_known_ways_out(device, first, second, offset, truth, solid):
     """In both orders, posed as one body; of a pair alone, and of all that the broad phase finds."""
     truth, models = truth[solid] if isinstance(truth, tuple) else truth, [block(*first), block(*second)]

@@ -6,7 +6,8 @@ from fractions import Fraction
 import numpy as np
 import warp as wp
 
-from oracles.triangle import cross, dot, into_frame_of_a, sub
+from oracles.triangle import dot, into_frame_of_a, sub
+from oracles.triangle_distance import over_edges, over_face
 
 
 def lattice_points(corners, count):
@@ -74,16 +75,12 @@ def farthest_distance(triangles, corners):
 def exact_distance_sq(point, corners):
     """Return the squared distance of a point of fractions to the nearest triangle, a Fraction."""
     found = []
-    for a, b, c in ([[Fraction(x) for x in corner] for corner in triangle] for triangle in corners.tolist()):
-        edges = [(sub(q, p), sub(point, p)) for p, q in ((a, b), (b, c), (c, a))]
-        for edge, to in edges:
-            along = min(max(dot(to, edge) / (dot(edge, edge) or 1), 0), 1)
-            away = [x - along * y for x, y in zip(to, edge)]
-            found.append(dot(away, away))
-        normal = cross(sub(b, a), sub(c, a))
-        if any(normal) and all(dot(cross(edge, to), normal) >= 0 for edge, to in edges):
-            found.append(dot(sub(point, a), normal) ** 2 / dot(normal, normal))
-    return min(found)
+    for triangle in ([[Fraction(x) for x in corner] for corner in triangle] for triangle in corners.tolist()):
+        for p, q in zip(triangle, triangle[1:] + triangle[:1]):
+            to = sub(point, p)
+            found += [dot(to, to), over_edges(to, sub(q, p))]
+        found.append(over_face(point, *triangle))
+    return min(x for x in found if x is not None)
 
 
 def over(a, b):

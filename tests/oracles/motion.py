@@ -5,7 +5,6 @@ from fractions import Fraction
 
 import numpy as np
 
-from oracles.distance import surface_distance
 from oracles.triangle import cross, dot, quaternion_matrix, sub
 
 
@@ -29,47 +28,10 @@ def posed(vertices, pose):
     return vertices @ quaternion_matrix(pose[3:]).T + pose[:3]
 
 
-def speed_of(vertices, start, end):
-    """Return a bound of the speeds of points: that of the origin, and the turn times the farthest one's distance."""
-    cosine = abs(start[3:] @ end[3:]) / np.linalg.norm(start[3:]) / np.linalg.norm(end[3:])
-    turn = 2 * np.arccos(min(1.0, cosine))
-    return np.linalg.norm(end[:3] - start[:3]) + turn * np.linalg.norm(vertices, axis=1).max()
-
-
-def apart_until(place, speed, near):
-    """Return a time until which two soups are apart by more than `near`: steps of the distance over both speeds.
-
-    Args:
-        place: Returns the corners (f, 3, 3) of either at a time.
-        speed: Bound of the sum of their points' speeds.
-    """
-    t = 0.0
-    while t < 1.0:
-        distance = surface_distance(*place(t))
-        if distance <= near:
-            return t
-        t += (distance - near / 2) / speed
-    return 1.0
-
-
-def rigid_soups(meshes, starts, ends):
-    """Return what `apart_until` takes for meshes (vertices, faces) that move rigidly."""
-
-    def place(t):
-        poses = [pose_between(*path, t) for path in zip(starts, ends)]
-        return [posed(vertices, pose)[faces] for (vertices, faces), pose in zip(meshes, poses)]
-
-    return place, sum(speed_of(vertices, *path) for (vertices, _), path in zip(meshes, zip(starts, ends)))
-
-
 def straight_soups(meshes, starts, ends):
-    """Return what `apart_until` takes for meshes whose vertices move straight."""
+    """Return a function of time that gives the corners (f, 3, 3) of meshes whose vertices move straight."""
     both = [[posed(vertices, pose) for (vertices, _), pose in zip(meshes, poses)] for poses in (starts, ends)]
-
-    def place(t):
-        return [((1 - t) * p + t * q)[faces] for p, q, (_, faces) in zip(*both, meshes)]
-
-    return place, sum(np.linalg.norm(q - p, axis=1).max() for p, q in zip(*both))
+    return lambda t: [((1 - t) * p + t * q)[faces] for p, q, (_, faces) in zip(*both, meshes)]
 
 
 def _inside(point, a, b, c):

@@ -84,7 +84,6 @@ def poses_of(shape, real, count=4):
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("shape", ["quaternions", "matrices"])
 def test_poses(device, framework, shape, real, monkeypatch):
-    """The same bits as from NumPy, for a scene and a sweep; and a sweep answers what a scene does."""
     monkeypatch.setattr(pose_sweep, "CHUNKS", (64,))
     poses = poses_of(shape, real)
     first, second = make_scene(device), make_scene(device)

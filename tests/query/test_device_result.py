@@ -34,7 +34,6 @@ def make_query(scene, output, pairs=MORE_PAIRS, **options):
 
 
 def as_host(value):
-    """Return a host array of what a result has on the device, contacts as records."""
     if not isinstance(value, dict):
         return None if value is None else value.numpy()
     columns = {name: array.numpy() for name, array in value.items()}
@@ -132,11 +131,7 @@ def test_nothing_to_find(device, packs):
                 assert expected.count.sum() == 0
             if output not in ("any", "count"):
                 assert expected.faces.shape == (0, 3) and expected.faces.dtype == np.int32
-    assert scene_is_asked_nothing(far)
-
-
-def scene_is_asked_nothing(scene):
-    return all(len(scene.intersect([], output, device=True).any) == 0 for output in ("any", "faces", "contacts"))
+        assert all(len(far.intersect([], output, device=True).any) == 0 for output in ("any", "faces", "contacts"))
 
 
 @pytest.mark.parametrize("keeps", [False, True], ids=["host", "device"])
@@ -299,13 +294,10 @@ def make_scene(device):
     return scene
 
 
-@pytest.mark.parametrize("output", ["any", "count", "faces", "contacts", "contacts of float32"])
+@pytest.mark.parametrize("output", OUTPUTS)
 def test_one_thread_and_any_device(device, output):
-    options, scene = {"contact_dtype": np.float32} if output.endswith("32") else {}, make_scene("cpu")
-    if "contacts" in output:
-        query = ab.ContactQuery(scene, pairs=PAIRS, within=0.05, **options)
-    else:
-        query = ab.Query(scene, output, pairs=PAIRS, within=0.05)
+    query = make_query(make_scene("cpu"), output, PAIRS, within=0.05)
+    options = {"contact_dtype": np.float32} if output.endswith("32") else {}
     with testing.regime(cpu_threads=1):
         expected = query.run()
     found = make_scene(device).intersect(PAIRS, output.split()[0], within=0.05, **options)

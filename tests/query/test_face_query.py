@@ -8,6 +8,7 @@ import pytest
 import trimesh
 import warp as wp
 from helpers import refused
+from helpers.scenes import scene_with
 from oracles.triangle import into_frame_of_a
 from oracles.triangle_distance import near_faces
 
@@ -85,12 +86,9 @@ def test_pairs_keep_their_order_and_a_hit_ends_one(sampled, scene_and_meshes):
     assert own.least.numpy()[2] == 2**40 and every.any.tolist() == [True, True, False]
     assert (every.count[:2] == every.triangle_tests[:2]).all() and (every.count[:2] > 100).all()
     first = FaceQuery(scene, visit_least, own, [(0, 1), (2, 0), (0, 3)], within=0.6, for_any=True).run()
+    refused(ValueError, "within", FaceQuery, scene, visit_least, own, [(0, 1)], within=-1.0)
     np.testing.assert_array_equal(first.any, every.any)
     assert first.count is None and (first.triangle_tests[:2] < every.triangle_tests[:2]).all()
-
-
-def test_refuses_bad_distances(scene_and_meshes):
-    refused(ValueError, "within", FaceQuery, scene_and_meshes[0], visit_least, LeastDistance(), [(0, 1)], within=-1.0)
 
 
 @wp.func
@@ -158,8 +156,5 @@ def test_takes_what_returns_on_all_ways(device, visit, hits):
     ],
 )
 def test_refuses_what_cannot_be_called(visit, own, message):
-    scene = ab.Scene(device="cpu")
-    for _ in range(2):
-        scene.add(ab.Model.load(trimesh.creation.box()))
-    with pytest.raises(TypeError, match=message):
-        FaceQuery(scene, visit, own, [(0, 1)])
+    box = ab.Model.load(trimesh.creation.box())
+    refused(TypeError, message, FaceQuery, scene_with("cpu", box, box), visit, own, [(0, 1)])

@@ -43,8 +43,6 @@ QUERIES = {
 @pytest.mark.parametrize("kind", QUERIES)
 @pytest.mark.slow
 def test_a_query_grows(device, memory, kind):
-    """With more pairs, or buffers that turn out too small: it goes on with the pairs it had, or takes the others."""
-
     def make():
         scene = make_scene(device)
         scene.add(scene.models[0], random_poses(np.random.default_rng(1), 1, 0.4)[0], lod=scene.lods[0])
@@ -67,8 +65,6 @@ def test_a_query_grows(device, memory, kind):
 
 
 def test_the_broad_phase_grows(device, memory):
-    """Among more objects in one place than it has room for pairs."""
-
     def make():
         scene = in_a_row(device, "box", [0.0] * 20)
         scene.batch()
@@ -98,8 +94,6 @@ CALLS = {
 @pytest.mark.parametrize("call", CALLS)
 @pytest.mark.parametrize("kind", OPERATORS)
 def test_queries(device, interruption, kind, call):
-    """After an interruption there is no result until the next launch, which is whole, or the query refuses for good."""
-
     def make():
         query = OPERATORS[kind](make_scene(device))
         query.run()
@@ -128,8 +122,6 @@ FRAMES = {
 @pytest.mark.parametrize("replayed", [False, True])
 @pytest.mark.parametrize("kind", FRAMES)
 def test_frames(device, interruption, kind, replayed):
-    """The next launch, or the replay of a graph captured before, gives what it gives on a frame of its own."""
-
     def make():
         frame = ab.Pipeline(add_objects(device), **{"output": "count", "pairs": MORE_PAIRS, **FRAMES[kind]})
         graph = frame.capture()
@@ -179,8 +171,6 @@ def test_no_mark_is_left(device, interruption):
 
 
 def test_a_capture(device, interruption):
-    """An interrupted capture leaves the frame as it was; it can be captured again."""
-
     def check(before, frame):
         wp.capture_launch(frame.capture())
         frame.check()
@@ -210,8 +200,6 @@ def test_sweeps(device, interruption):
 
 
 def test_bodies(device, interruption):
-    """A step is whole, or has not begun, or the bodies refuse."""
-
     def make():
         scene = ab.Scene(device)
         for height in (0, 0.9, 1.85):

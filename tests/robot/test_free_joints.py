@@ -1,12 +1,11 @@
 """Planar and floating joints of URDF, free ones of MJCF: poses by SciPy and MuJoCo, answers against FCL, edges."""
 
-import fcl
 import numpy as np
 import pytest
 import trimesh
 from helpers import refused
-from helpers.robots import MJCF, URDF, asked_pairs, random_configurations, write_arm
-from oracles.peers import fcl_object
+from helpers.robots import MJCF, URDF, InFcl, asked_pairs, random_configurations, write_arm
+from oracles.peers import STILL
 from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
@@ -61,14 +60,9 @@ def test_a_floating_joint_has_xyz_and_rpy(tmp_path, device):
     poses = arm.forward(rows).numpy()
     np.testing.assert_allclose(poses[:, upper], expected, atol=1e-13)
     np.testing.assert_array_equal(poses[:, base], np.tile(np.eye(4), (80, 1, 1)))
-    parts, wall = [fcl_object(*model.mesh_at(model.lod_max)[:2]) for model in arm.models], fcl_object(*mesh_of(WALL))
-    hit = []
-    for matrices in poses[:, arm.model_link]:
-        for part, matrix in zip(parts, matrices):
-            part.setTransform(fcl.Transform(matrix[:3, :3], matrix[:3, 3]))
-        pairs = [*[(parts[i], parts[j]) for i, j in arm.pairs], *[(part, wall) for part in parts[1:]]]
-        hit.append(any(fcl.collide(a, b) for a, b in pairs))
     arm.mounted = [base]
+    in_fcl = InFcl(arm, [(ab.Model.load(WALL), STILL)])
+    hit = [in_fcl.ask(matrices)[0] for matrices in poses]
     assert 10 < sum(hit) < 70
     np.testing.assert_array_equal(arm.check(rows, ab.Model.load(WALL)), hit)
     starts, ends = rows[:20], rows[:20] + 0.2 * (rows[20:40] - rows[:20])
@@ -77,10 +71,6 @@ def test_a_floating_joint_has_xyz_and_rpy(tmp_path, device):
     met = arm.check(sampled.reshape(-1, 8), ab.Model.load(WALL)).reshape(20, 60)
     assert 3 < edges["clear"].sum() < 17 and not met[edges["clear"]].any()
     assert not (met & (np.linspace(0, 1, 60) < edges["time"][:, None])).any()
-
-
-def mesh_of(mesh):
-    return mesh.vertices, mesh.faces
 
 
 def test_a_free_joint_is_the_pose_of_its_body_in_the_world(tmp_path, device):

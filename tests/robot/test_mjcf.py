@@ -141,8 +141,6 @@ def test_equalities_and_tendons_that_nothing_enforces_are_named(tmp_path):
 
 @pytest.mark.parametrize("scale", ["1 1 1", "-1 1 1", "-1 -2 1", "-1 -1 -1"])
 def test_mirrored_meshes_keep_their_outside(scale, tmp_path):
-    import trimesh
-
     trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / "part.stl")
     mesh = f'<asset><mesh name="m" file="part.stl" scale="{scale}"/></asset>'
     robot = load(f'<mujoco>{mesh}<worldbody><body><geom type="mesh" mesh="m"/></body></worldbody></mujoco>', tmp_path)
@@ -151,7 +149,6 @@ def test_mirrored_meshes_keep_their_outside(scale, tmp_path):
     np.testing.assert_allclose(volume, 0.006 * abs(np.prod([float(x) for x in scale.split()])), rtol=1e-6)
 
 
-pytest.importorskip("mujoco")
 LETTER = [(0, 0), (4, 0), (4, 1), (1, 1), (1, 3), (4, 3), (4, 4), (0, 4)]  # area 10, perimeter 22
 
 
@@ -229,8 +226,8 @@ class FilesInFcl:
         root, self.model = ElementTree.parse(path).getroot(), mujoco.MjModel.from_xml_path(str(path))
         self.data, self.geoms = mujoco.MjData(self.model), []
         folder = path.parent / root.find("compiler").get("meshdir")
-        files = {entry.get("name", Path(entry.get("file")).stem): entry.get("file") for entry in root.iter("mesh")
-                 if entry.get("file")}  # fmt: skip
+        meshes = [entry for entry in root.iter("mesh") if entry.get("file")]
+        files = {entry.get("name", Path(entry.get("file")).stem): entry.get("file") for entry in meshes}
         for g in range(self.model.ngeom):
             if (self.model.geom_contype[g] == 0) != (geometry == "visual"):
                 continue
@@ -242,7 +239,6 @@ class FilesInFcl:
             self.geoms.append((int(self.model.geom_bodyid[g]), fcl_object(mesh.vertices, mesh.faces)))
 
     def pose(self, values):
-        """Pose the geoms for the values of joints by name."""
         for name, value in values.items():
             self.data.qpos[self.model.joint(name).qposadr[0]] = value
         mujoco.mj_kinematics(self.model, self.data)

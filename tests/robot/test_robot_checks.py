@@ -5,7 +5,6 @@ import pickle
 import re
 from dataclasses import replace
 
-import fcl
 import numpy as np
 import pytest
 import trimesh
@@ -16,6 +15,7 @@ from helpers.robots import (
     AROUND,
     RING,
     ROOF,
+    InFcl,
     asked_pairs,
     described_arm,
     described_chain,
@@ -24,7 +24,6 @@ from helpers.robots import (
 )
 from helpers.samples import STILL
 from helpers.scenes import scene_with
-from oracles.peers import fcl_object
 
 import warp_abtree as ab
 from warp_abtree.interop.robot import link_query, robot
@@ -34,24 +33,6 @@ from warp_abtree.interop.robot.description import Description, RobotFrame
 @pytest.fixture
 def arm(device):
     return ab.Robot(described_arm(), device, mounted=["base"])
-
-
-class AskFcl:
-    """Whether any pair intersects at a configuration, and the least distance, link by link."""
-
-    def __init__(self, arm):
-        self.arm = arm
-        self.parts = [fcl_object(*model.mesh_at(model.lod_max)[:2]) for model in arm.models]
-        others = [fcl_object(*model.mesh_at(model.lod_max)[:2], pose) for model, pose in AROUND]
-        self.pairs = [(part, other) for k, part in enumerate(self.parts) if k != 0 for other in others]
-        self.pairs += [(self.parts[i], self.parts[j]) for i, j in arm.pairs]
-
-    def __call__(self, row):
-        for part, matrix in zip(self.parts, pose_frames(self.arm.description, row)[self.arm.model_link]):
-            part.setTransform(fcl.Transform(matrix[:3, :3], matrix[:3, 3]))
-        hit = any(fcl.collide(a, b) for a, b in self.pairs)
-        request, result = fcl.DistanceRequest(), fcl.DistanceResult
-        return hit, 0.0 if hit else min(fcl.distance(a, b, request, result()) for a, b in self.pairs)
 
 
 def test_forward_kinematics_is_a_product_of_matrices(arm):
@@ -77,8 +58,8 @@ def test_pairs_leave_neighbours_and_excluded_links_out(device):
 
 def test_answers_are_those_of_fcl(arm):
     rows = random_configurations(300, seed=1)
-    ask_fcl = AskFcl(arm)
-    hit, far = np.array([ask_fcl(row) for row in rows]).T
+    in_fcl = InFcl(arm, AROUND)
+    hit, far = np.array([in_fcl.ask(pose_frames(arm.description, row)) for row in rows]).T
     assert 60 < hit.sum() < 240
     np.testing.assert_array_equal(arm.check(rows, AROUND), hit != 0)
     found = arm.check(rows, AROUND, output="distance")
@@ -309,11 +290,8 @@ def test_bad_options_are_refused(arm, device):
         (lambda: ab.Robot(described_arm(), device, mounted=None), TypeError, "mounted: None is a NoneType"),
     ):
         refused(error, message, call)
+    described_arm_without_parts = described_arm()
+    described_arm_without_parts.parts = []
+    refused(ValueError, "no link with a mesh", ab.Robot, described_arm_without_parts, device)
     assert arm.check(np.empty((0, 4))).shape == (0,) and len(arm.check_edges(rows[:0], rows[:0])) == 0
     assert arm.check(rows + [0, 3, 0, 0], limits=False).shape == (1,)
-
-
-def test_a_robot_needs_a_mesh(device):
-    empty = described_arm()
-    empty.parts = []
-    refused(ValueError, "no link with a mesh", ab.Robot, empty, device)

@@ -30,13 +30,11 @@ def arms():
 
 
 def random_edges(count, seed, part=0.15):
-    """Return short edges within limits."""
     starts, others = random_configurations(count, seed=seed), random_configurations(count, seed=(seed, 1))
     return starts, starts + part * (others - starts)
 
 
 def meets(arm, around, starts, ends, times):
-    """Return whether parts intersect on edges (e, n) at times (e, t), bool (e, t)."""
     rows = starts[:, None] + times[..., None] * (ends - starts)[:, None]
     return arm.check(rows.reshape(-1, starts.shape[1]), around, limits=False).reshape(times.shape)
 
@@ -165,9 +163,8 @@ def test_an_edge_passes_through_nothing_thin(arms, device):
     assert not rows["clear"][0] and not rows["undecided"][0]
     # Within the tolerance of the time there is contact, and before it none at as many more configurations.
     time = rows["time"][0]
-    at, before = (
-        ends[0] + np.linspace(*span, 500)[:, None] * (ends[1] - ends[0]) for span in ((time, time + 1e-5), (0, time))
-    )
+    way = ends[1] - ends[0]
+    at, before = (ends[0] + np.linspace(*span, 500)[:, None] * way for span in ((time, time + 1e-5), (0, time)))
     assert arm.check(at, blade).any() and not arm.check(before, blade).any()
 
 
@@ -211,9 +208,8 @@ def find_reach(description, device, middle, half, size):
     reach = wp.zeros(1, dtype=wp.float64, device=device)
     inputs = [links.chain, links.frames, links.parts, links.chunk, reach]
     wp.launch(reach_kernel, 1, inputs, device=device)
-    rotation, position = (
-        a.numpy()[0, -1].astype(np.longdouble) for a in (links.frames.rotation, links.frames.position)
-    )
+    placed = links.frames.rotation, links.frames.position
+    rotation, position = (array.numpy()[0, -1].astype(np.longdouble) for array in placed)
     return reach.numpy()[0], description.parts[0].mesh.vertices @ rotation.T + position
 
 

@@ -88,19 +88,6 @@ def test_mjcf_meshes_and_pairs(mjcf):
     assert visual.models[1].face_count > arm.models[1].face_count
 
 
-def test_files_answer_as_scenes_of_their_links(urdf, device):
-    arm = ab.Robot.load(urdf, device=device)
-    rows = random_configurations(60, arm.limits, seed=2)
-    scene = ab.Scene(device)
-    scene.add_many(arm.models, np.tile(np.eye(4), (len(arm.models), 1, 1)))
-    expected = []
-    for poses in arm.forward(rows).numpy():
-        scene.set_poses(poses[arm.model_link])
-        expected.append(scene.intersect(arm.pairs).any.any())
-    assert 3 < sum(expected) < 57
-    np.testing.assert_array_equal(arm.check(rows), expected)
-
-
 def test_a_limit_that_urdf_leaves_out_is_zero(urdf):
     urdf.write_text(URDF.replace('lower="-2.8"', ""), encoding="utf-8")
     np.testing.assert_array_equal(ab.Robot.load(urdf, device="cpu").limits[1], [0, 2.8])
@@ -263,7 +250,5 @@ def test_bad_paths_and_options_are_refused(urdf, tmp_path):
 @pytest.mark.parametrize("name, library", [("arm.urdf", "yourdfpy"), ("arm.xml", "mujoco")])
 def test_without_the_extra_there_is_one_line(name, library, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(
-        ImportError, match=r"^an? \w+ file needs the extra `robot`: pip install 'warp-abtree\[robot\]'$"
-    ):
-        ab.Robot.load(write_arm(tmp_path, URDF, name))
+    said = r"^an? \w+ file needs the extra `robot`: pip install 'warp-abtree\[robot\]'$"
+    refused(ImportError, said, ab.Robot.load, write_arm(tmp_path, URDF, name))

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 import warp as wp
 from helpers import refused
+from helpers.questions import to_matrix
 from helpers.robots import AROUND, MJCF, URDF, described_arm, pose_frames, random_configurations, write_arm
 from scipy.spatial.transform import Rotation
 
@@ -14,10 +15,7 @@ BASE = (0.3, -0.2, 0.1, *Rotation.from_rotvec((0.2, -0.5, 1.1)).as_quat())
 
 
 def matrix_of(pose):
-    """Return a pose of 7 numbers as a matrix (4, 4)."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]
-    return matrix
+    return to_matrix(Rotation.from_quat(pose[3:]).as_matrix(), pose[:3])
 
 
 @pytest.fixture
@@ -37,16 +35,13 @@ def test_a_base_moves_the_robot_in_the_world(name, text, extra, tmp_path, device
         placed = ab.Robot.load(path, device=device, base=given)
         np.testing.assert_allclose(placed.forward(rows).numpy(), expected, atol=tolerance)
         turned = placed.forward(rows[0]).numpy()[:, :3, :3]
-        np.testing.assert_allclose(
-            turned @ turned.transpose(0, 2, 1), np.tile(np.eye(3), (len(turned), 1, 1)), atol=1e-14
-        )
+        np.testing.assert_allclose(turned @ turned.transpose(0, 2, 1), [np.eye(3)] * len(turned), atol=1e-14)
     hit = still.check(rows, AROUND)
     assert 3 < hit.sum() < 37
     np.testing.assert_array_equal(placed.check(rows, moved), hit)
     assert not np.array_equal(placed.check(rows, AROUND), hit)
-    times = [
-        robot.check_edges(rows[:9], rows[1:10], world)["time"] for robot, world in ((still, AROUND), (placed, moved))
-    ]
+    asked = (still, AROUND), (placed, moved)
+    times = [robot.check_edges(rows[:9], rows[1:10], world)["time"] for robot, world in asked]
     np.testing.assert_allclose(*times, atol=2e-3)
     for bad, message in (
         ((0, 0, 0), "base: shape"),
@@ -74,9 +69,8 @@ def test_locked_joints_stand_at_their_values(tmp_path, device):
     edges = locked.check_edges(rows[:6], rows[1:7], AROUND)
     np.testing.assert_array_equal(edges, whole.check_edges(full[:6], full[1:7], AROUND))
     still = ab.Robot.load(path, device=device, locked=at | {"bend": 1.0})
-    assert still.joint_names == () and bool(still.check([], AROUND)) == bool(
-        whole.check([0.7, 1.0, at["grip"]], AROUND)
-    )
+    expected = whole.check([0.7, 1.0, at["grip"]], AROUND)
+    assert still.joint_names == () and bool(still.check([], AROUND)) == bool(expected)
     for bad, kind, message in (
         ({"follow": 0.0}, ValueError, "locked: a configuration has no joint 'follow'"),
         ({"mount": 0.0}, ValueError, "no joint 'mount'"),
@@ -119,10 +113,8 @@ def test_a_robot_is_added_to_a_scene_where_it_stands(device):
     placed = ab.to_trimesh(scene, names=["ring", *map(scene.name, range(1, 7))])
     for part, matrix in zip(arm.description.parts, pose_frames(arm.description, rows[-1])[arm.model_link]):
         pose, geometry = placed.graph[arm.link_names[part.link]]
-        found, posed = (
-            trimesh.transform_points(v, m)
-            for v, m in ((placed.geometry[geometry].vertices, pose), (part.mesh.vertices, matrix))
-        )
+        found = trimesh.transform_points(placed.geometry[geometry].vertices, pose)
+        posed = trimesh.transform_points(part.mesh.vertices, matrix)
         np.testing.assert_allclose([found.min(0), found.max(0)], [posed.min(0), posed.max(0)], atol=1e-12)
     for call, kind, message in (
         (lambda: arm.add_to([], rows[0]), TypeError, "a list is no Scene"),

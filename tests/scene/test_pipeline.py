@@ -110,7 +110,6 @@ FRAMES = {
 @pytest.mark.parametrize("captured", [True, False])
 @pytest.mark.parametrize("case", FRAMES)
 def test_answers_are_those_of_the_scene(device, case, captured):
-    """Whatever is asked; also where objects share states in groups, or take the levels of a ladder."""
     options, scene = dict(FRAMES[case]), add_objects(device)
     request = {name: value for name, value in options.items() if name not in ("groups", "ladder")}
     group, snap = options.get("groups"), None
@@ -146,7 +145,6 @@ def test_worlds_statics_filter(device):
 
 
 def test_the_start_is_the_scene(device):
-    """Also where poses were set as matrices; and the scene stays as it was."""
     scene = add_objects(device)
     lods = tops(scene) * np.arange(len(CROWD)) // len(CROWD)
     scene.set_lods(lods)
@@ -262,11 +260,8 @@ def test_lost_work_is_told(device):
     expected = scene.intersect(output="faces")
     hits = len(expected.faces)
     scene.set_poses(far)
-    for room, pairs, message in (
-        (2 * hits, 14, "pairs=15.*for 14"),
-        (hits - 1, 15, f"hits={hits}.* for {hits - 1}"),
-        (hits, 15, None),
-    ):
+    full = (2 * hits, 14, "pairs=15.*for 14"), (hits - 1, 15, f"hits={hits}.* for {hits - 1}"), (hits, 15, None)
+    for room, pairs, message in full:
         frame = ab.Pipeline(scene, "faces", capacity=ab.Buffers(room, pairs=pairs))
         launch = scenes.replay(frame)
         for poses in (far, near, far):

@@ -109,7 +109,6 @@ def test_one_value_serves_all_objects_that_are_added(device):
 
 
 def test_a_query_follows_poses_and_lods(device):
-    """Launched again after every change; its answers are those of a scene made so from the start."""
     rng, hits, pairs = np.random.default_rng(4), 0, [[0, 1], [2, 0], [3, 1], [2, 3]]
     scene = add_objects(device, ["torus", "capsule", "torus", "crumbs"])
     models = [scene.models[m] for m in scene.object_model]
@@ -134,9 +133,7 @@ def test_a_query_follows_poses_and_lods(device):
 
 def test_what_is_printed_says_what_is_held(device):
     """A user's first `print` of a scene and of a result, and a path in the place of a model."""
-    scene, model = ab.Scene(device), sample("box")
-    for _ in range(2):
-        scene.add(model)
+    scene = scene_with(device, sample("box"), sample("box"))
     assert repr(scene) == f"Scene('{device}', objects=2, models=1)"
     assert repr(scene.intersect(output="faces")) == "Result(pairs=1, any, faces, count)"
     assert repr(scene.intersect(device=True)) == "Result(pairs=1, any)"
@@ -144,7 +141,6 @@ def test_what_is_printed_says_what_is_held(device):
 
 
 def test_names_of_a_model_may_repeat(device):
-    """Models count by identity: two models of one name are two models."""
     vertices, faces, _ = sample("box").mesh_at(sample("box").lod_max)
     twins = [ab.Model.from_arrays(vertices * s, faces, name="same") for s in (1.0, 5.0)]
     scene = scene_with(device, *twins, twins[0])
@@ -318,11 +314,8 @@ def test_an_empty_scene(device):
     scene, none, other = ab.Scene(device), "^the scene has no object$", "no object|0 objects|outside"
     assert scene.object_count == 0 and len(scene.lods) == 0 and scene.broad_phase().shape == (0, 2)
     calls = [(call, (scene,), none) for call in (ab.Scene.intersect, ab.Query, ab.Pipeline, ab.Frame)]
-    calls += [
-        (scene.set_lods, ([],), none),
-        (scene.set_poses, (np.empty((0, 7)),), none),
-        (scene.intersect, ([],), none),
-    ]
+    calls += [(scene.set_poses, (np.empty((0, 7)),), none)]
+    calls += [(call, ([],), none) for call in (scene.set_lods, scene.intersect)]
     for call, given, message in [*calls, (scene.intersect, ([(0, 1)],), other), (scene.tree_state, (0,), other)]:
         refused(ValueError, message, call, *given)
     scene.add(sample("box"))

@@ -109,16 +109,10 @@ def test_what_is_removed_is_nowhere(device):
     assert scene.object_count == 3 and scene.present.tolist() == [True, False, True]
     scene.set_poses(scene.poses)
     before = everything(scene)
-    for call, *arguments in (
-        (scene.intersect, [(0, 2), (2, 1)]),
-        (scene.first_contact, [(1, 0)], scene.poses),
-        (scene.filter, [(1, 0)]),
-        (scene.set_pose, 1, STILL),
-        (scene.name, 1),
-        (scene.tree_state, 1),
-        (scene.remove, [0, 1]),
-        (scene.change, 1, 0),
-    ):
+    calls = [(scene.intersect, [(0, 2), (2, 1)]), (scene.filter, [(1, 0)]), (scene.remove, [0, 1])]
+    calls += [(scene.first_contact, [(1, 0)], scene.poses)]
+    calls += [(scene.set_pose, 1, STILL), (scene.name, 1), (scene.tree_state, 1)]
+    for call, *arguments in [*calls, (scene.change, 1, 0)]:
         refused(ValueError, "object 1.* removed", call, *arguments)
     refused(ValueError, "twice", scene.remove, [0, 0])
     refused(ValueError, "outside 0 .. 2", scene.remove, [0, 3])
@@ -288,13 +282,12 @@ def test_a_pickled_result_holds_the_names_of_its_objects(device):
 
 
 def test_results_are_rows_with_names(device, tmp_path):
-    """Of every output, from host and device alike, and also once what they were about has changed."""
     scene, pairs, names = pair_scene(device), [(1, 2), (0, 1)], ["small ball 0", "nut, M20", "small ball 2"]
     scene.change(1, name=names[1])
     for output in ("any", "contacts", "distance", "first_contact"):
         ask = scene.first_contact if output == "first_contact" else scene.intersect
-        first, last = ask(pairs, scene.poses if output == "first_contact" else output), None
-        last = ask(pairs, scene.poses if output == "first_contact" else output, device=True)
+        asked = scene.poses if output == "first_contact" else output
+        first, last = ask(pairs, asked), ask(pairs, asked, device=True)
         rows = first.rows()
         scene.change(1, name="other")
         assert rows == first.rows() == last.rows()
@@ -311,7 +304,7 @@ def test_results_are_rows_with_names(device, tmp_path):
             point = [[float(row[f"point_{axis}"]) for axis in "xyz"] for row in table]
             np.testing.assert_array_equal(point, first.pair_contacts["point"])
         # Without a pair too, the table has these columns.
-        none = ask([], scene.poses if output == "first_contact" else output, device=output == "any")
+        none = ask([], asked, device=output == "any")
         none.to_csv(tmp_path / "none.csv")
         assert none.rows() == []
         with open(tmp_path / "none.csv", newline="", encoding="utf-8") as file:

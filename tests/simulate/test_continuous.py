@@ -21,13 +21,10 @@ FREE = {"gravity": (0, 0, 0)}
 
 
 def surfaces_meet(dynamics):
-    """Ask the exact test, of all pairs of the broad phase, which the steps do not."""
-    scene = dynamics.scene
-    return scene.intersect(scene.broad_phase(), output="any").any.any()
+    return dynamics.scene.intersect(dynamics.scene.broad_phase(), output="any").any.any()
 
 
 def energy(dynamics, g=9.81):
-    """Kinetic energy, and potential energy under gravity along -z."""
     rigid = dynamics.rigid
     velocity, angular = (rows[rigid] for rows in dynamics.velocities())
     z, momentum = dynamics.bodies.position.numpy()[rigid, 2], dynamics.bodies.momentum.numpy()[rigid]
@@ -120,7 +117,6 @@ def test_bodies_that_overlap_at_first_are_not_stopped(device):
 
 
 def test_a_kinematic_object_stops_too_and_catches_up(device):
-    """It presses a brick on the floor, and is late for its target until it turns back."""
     bricks = [(BRICK, (0, 0, z, 0, 0, 0, 1)) for z in (0.3, 1.0)]
     dynamics = on_ground(device, *bricks, kinematic=[2], continuous=True)
     for z in (0.9, 0.6, 0.4):

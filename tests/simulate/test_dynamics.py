@@ -293,18 +293,16 @@ def test_shuttle_reflects_at_its_ends(time, way):
     assert np.allclose(motion.poses(time)[0, :3], [0.5 + way, -2.0 * way, 1.0 + 0.5 * way])
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"position": [0.0, 0.0, 0.0]},
-        {"velocity": np.zeros((2, 3))},
-        {"velocity": [np.nan, 0, 0]},
-        {"rotation": [0.0, 0.0, 0.0, 2.0]},
-        {"axis": [0.0, 0.0, 0.0], "rate": 1.0},
-        {"period": 0.0},
-        {"period": np.nan},
-    ],
+WRONG = (
+    {"position": [0.0, 0, 0]},
+    {"velocity": np.zeros((2, 3))},
+    {"velocity": [np.nan, 0, 0]},
+    {"rotation": [0.0, 0, 0, 2]},
 )
+WRONG += {"axis": [0.0, 0, 0], "rate": 1.0}, {"period": 0.0}, {"period": np.nan}
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=str)
 def test_motion_refuses(wrong):
     refused(ValueError, next(iter(wrong)), ab.Kinematic, **{"position": np.zeros((3, 3)), **wrong})
 

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers import refused
-from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, TORUS, bits, box, make, on_ground, run
+from helpers.bodies import CUBE, FLOOR, GROUND, bits, box, heap, make, on_ground, run
 from helpers.questions import captured
 from helpers.samples import grid
 
@@ -15,22 +15,9 @@ from warp_abtree.kernels.bodies import graph_coloring
 
 pytestmark = pytest.mark.slow
 
-SHAPES = (BRICK, TORUS, BALL)
-
-
-def heap(device, count=9, **options):
-    """Bodies that fall onto each other."""
-    rng = np.random.default_rng(0)
-    turns = rng.normal(size=(count, 4))
-    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
-    places = [*rng.uniform(-0.4, 0.4, (count, 2)).T, 0.6 + 0.5 * np.arange(count)]
-    poses = np.concatenate([np.transpose(places), turns], axis=1)
-    return on_ground(device, *((SHAPES[i % 3], pose) for i, pose in enumerate(poses)), **options)
-
 
 @cache
 def fall(device):
-    """Return where a heap falls, `bits`, by plain steps."""
     return run(heap(device), 80)
 
 
@@ -43,7 +30,6 @@ def test_a_heap_falls_the_same_again_however_it_is_relaxed(device, by_color):
 
 
 def test_a_body_in_more_contacts_than_colors(device):
-    """A plate with 36 cubes: the pairs beyond the number of colors are relaxed in turn."""
     cube = box(0.3, 0.3, 0.3)
     cubes = [(cube, (0.6 * x - 1.5, 0.6 * y - 1.5, 0.2495 + 0.1, 0, 0, 0, 1)) for x in range(6) for y in range(6)]
     plate = box(4, 4, 0.2)

@@ -97,7 +97,6 @@ def test_poses(device, fault):
 
 
 def test_first_use(device, fault):
-    """A scene whose arrays were never made gets them at the next call."""
     whole = fault.check_scene(None, add_objects(device))
 
     def check(before, scene):
