@@ -105,14 +105,16 @@ def measure_points(name, model, device, count):
     mesh = wp.Mesh(corners, wp.array(faces.ravel(), dtype=int, device=device), support_winding_number=signed)
     found = wp.empty(count, dtype=float, device=device)
     inputs = [mesh.id, int(signed), rows, found]
+    asked = points if device.is_cpu else wp.array(points, dtype=wp.vec3d, device=device)
     calls = {
-        "ours": lambda: ab.signed_distance(model, points, device=device.alias, signed=signed),
+        "ours": lambda: ab.signed_distance(model, asked, device=device.alias, signed=signed),
+        "host": lambda: ab.signed_distance(model, points, device=device.alias, signed=signed),
         "peer": lambda: wp.launch(ask_mesh_kernel, count, inputs, device=device),
     }
     clock = time.thread_time if device.is_cpu else time.perf_counter
     with one_core() if device.is_cpu else contextlib.nullcontext():
         times = time_rounds({who: time_call(call, device, clock) for who, call in calls.items()}, 5)
-    truth = calls["ours"]()
+    truth = calls["host"]()
     row = {"device": device.name, "workload": name, "faces": model.face_count, "points": count, "signed": signed}
     row |= {
         "inside": np.count_nonzero(truth < 0),

@@ -70,12 +70,19 @@ def square_outside(node: Node, x: wp.vec3d):
 @native.func_native()
 def open_node(
     boxes: wp.array(dtype=wp.vec4),
-    at: wp.int32,
+    start: wp.int32,
+    node: wp.int32,
     x: wp.vec3d,
     squares: wp.ref[wp.vec2d],
     codes: wp.ref[wp.vec2i],
 ):
-    """Find the squared distances of a point from two siblings' boxes, and what they stand for, ~face of a leaf."""
+    """Find the squared distances of a point from the boxes of a node's children, and what these stand for.
+
+    Args:
+        start: Where the tree begins in the pool.
+        node: In its tree.
+        codes: The node that each stands for, ~face for a leaf.
+    """
 
 
 @wp.func
@@ -164,7 +171,7 @@ def nearest_face_within(
         live = bound[end] <= limit and bound[end] < wp.float64(wp.inf)
         if live and below >= 0:
             squares, codes = wp.vec2d(), wp.vec2i()
-            open_node(trees.states.node_box, solid.node + 2 * below, x, squares, codes)
+            open_node(trees.states.node_box, solid.node, below, x, squares, codes)
             # The nearer one on top.
             turn = wp.where(squares[0] < squares[1], 1, 0)
             stack[end] = codes[turn]

@@ -33,6 +33,33 @@ BOX_GROW = wp.constant(wp.float64(1.0 + 2.0**-30))
 
 
 @wp.kernel(module_options=MODULE_OPTIONS, module="unique")
+def bound_point_kernel(
+    step: wp.int32, most: wp.float64, points: wp.array(dtype=wp.vec3d), bounds_inout: wp.array(dtype=wp.float64)
+):
+    """Find the box of points, and the first that is not finite or has a coordinate beyond the most, a part a thread.
+
+    Args:
+        step: How many threads there are.
+        bounds_inout: Least coordinates, infinite at first; greatest ones, minus infinite; that point, infinite; [7].
+    """
+    infinite, i = wp.float64(wp.inf), wp.int32(wp.tid())
+    lower, bad = wp.vec3d(infinite, infinite, infinite), wp.float64(wp.inf)
+    upper = -lower
+    while i < points.shape[0]:
+        for k in range(3):
+            x = points[i][k]
+            if not wp.abs(x) <= most:
+                bad = wp.min(bad, wp.float64(i))
+            lower[k] = wp.min(lower[k], x)
+            upper[k] = wp.max(upper[k], x)
+        i += step
+    for k in range(3):
+        wp.atomic_min(bounds_inout, k, lower[k])
+        wp.atomic_max(bounds_inout, 3 + k, upper[k])
+    wp.atomic_min(bounds_inout, 6, bad)
+
+
+@wp.kernel(module_options=MODULE_OPTIONS, module="unique")
 def code_point_kernel(
     lower: wp.vec3d,
     cell: wp.float64,

@@ -4,6 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+import warp as wp
 from helpers import refused
 from helpers.samples import sample
 from helpers.solids import model_of, shell, turned, voxel_mesh
@@ -204,3 +205,29 @@ def test_bad_points_and_models_are_refused(device):
     refused(ValueError, "signed", ab.signed_distance, ball, still, signed=1)
     refused(TypeError, "not a Model", ab.contains, "ball.obj", still)
     refused(MeshError, "closed", ab.signed_distance, sample("soup"), still, device=device)
+
+
+def test_points_of_a_gpu_stay_there():
+    """With the bytes that the same points on the host have; bad ones are named, and so is another device."""
+    if not wp.is_cuda_available():
+        pytest.skip("no GPU")
+    rng, model = np.random.default_rng(5), sample("torus")
+    points = rng.uniform(-1.5, 1.5, (70_000, 3))
+    rows = wp.array(points, dtype=wp.vec3d, device="cuda:0")
+    host = ab.signed_distance(model, points, device="cuda:0", nearest=True)
+    found = ab.signed_distance(model, rows, nearest=True)
+    assert [part.device.is_cuda for part in found] == [True] * 3
+    assert [part.numpy().tobytes() for part in found] == [part.tobytes() for part in host]
+    np.testing.assert_array_equal(ab.contains(model, rows), host[0] < 0)
+    scene = ab.Scene("cuda:0")
+    scene.add(model, solid=True)
+    assert scene.signed_distance(rows)[0].numpy().tobytes() == host[0].tobytes()
+    none = wp.empty(0, dtype=wp.vec3d, device="cuda:0")
+    assert ab.signed_distance(model, none).shape == (0,)
+    refused(
+        ValueError, "points: on cuda:0, the model or scene is on cpu", ab.signed_distance, model, rows, device="cpu"
+    )
+    for bad, what in ((np.nan, "is not finite"), (-np.inf, "is not finite"), (1e160, "has a coordinate beyond")):
+        points[[40_000, 60_000], 1] = bad
+        rows = wp.array(points, dtype=wp.vec3d, device="cuda:0")
+        refused(ValueError, f"point 40000 {what}", ab.signed_distance, model, rows)

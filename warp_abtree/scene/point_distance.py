@@ -7,6 +7,7 @@ holds of R^T (p - t), the point in the frame of an object that R and t pose, as 
 """
 
 import weakref
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -26,7 +27,7 @@ from warp_abtree.scene.posed_objects import PosedObjects
 RUNS = {"cpu": 256, "cuda": 1}
 # Models whose device arrays are kept for the next call.
 KEPT_MODELS = 4
-TOO_FAR = "has a coordinate beyond 2^300, the most that a mesh may have"
+BOUND_THREADS = 4096
 OUTPUTS = "distance", "object", "nearest", "face"
 
 _kept: dict[tuple, tuple] = {}
@@ -38,7 +39,8 @@ def signed_distance(
     """Return the distances of points from a model's surface, negative inside. Waits for the device.
 
     Args:
-        points: (n, 3) in the model's frame [model units], of any framework.
+        points: (n, 3) in the model's frame [model units], of any framework. A Warp array of vec3d on a GPU stays there,
+            and so do the results, Warp arrays of their own.
         lod: LOD of the model; None is the finest.
         device: Warp device; None for Warp's default.
         signed: Whether insides count; False takes meshes that are not closed, too.
@@ -59,7 +61,8 @@ def signed_distance(
     if flag(signed, "signed"):
         check_solid(model.winding, model.name, stacklevel=3)
     return_nearest, lod = flag(nearest, "nearest"), model.lod_max if lod is None else model.check_lod(lod)
-    points = _check_points(points)
+    if _is_on_gpu(points):
+        device = points.device if device is None else device
     scene = _find_scene(model, lod, device)
     check_device(scene.device, "ab.signed_distance")
     names = ("distance", "nearest", "face") if return_nearest else ("distance",)
@@ -69,13 +72,13 @@ def signed_distance(
 
 def contains(model: Model, points, lod=None, device=None) -> np.ndarray:
     """Return which points lie inside a closed model, bool (n,); arguments and errors are those of `signed_distance`."""
-    return signed_distance(model, points, lod, device, within=0.0) < 0
+    return to_numpy(signed_distance(model, points, lod, device, within=0.0), "distance") < 0
 
 
 def object_distances(scene: PosedObjects, points, world, signed, within, nearest) -> tuple:
     """Find the distances of points from the objects of a scene, see `Scene.signed_distance`."""
     check_device(scene.device, "Scene.signed_distance")
-    signed, nearest, points = flag(signed, "signed"), flag(nearest, "nearest"), _check_points(points)
+    signed, nearest = flag(signed, "signed"), flag(nearest, "nearest")
     world = whole_number(world, "world", -1, 2**31 - 1)
     objects = np.flatnonzero(scene.present & np.isin(scene.worlds, (world, -1)))
     if not len(objects):
@@ -91,40 +94,66 @@ def object_distances(scene: PosedObjects, points, world, signed, within, nearest
 def _measure(scene, asked, points, within, names) -> tuple:
     """Return outputs of points from objects of a scene, rows of (object, whether it has an inside), by their names."""
     most = np.inf if within is None else float(check_within(within, known="points: one distance for all"))
-    batch, n, device = scene.batch(), len(points), scene.device
+    batch, device, stays = scene.batch(), scene.device, _is_on_gpu(points)
+    if stays and points.device != device:
+        raise ValueError(f"points: on {points.device}, the model or scene is on {device}")
+    rows, lower, upper = _bound_on_gpu(points) if stays else _bound_on_host(points, device)
+    n = len(rows)
     found = zeros_of(kernels.PointDistances, n, 0, device)
     if n:
-        rows = wp.array(points, dtype=wp.vec3d, device=device)
         run = RUNS["cpu" if device.is_cpu else "cuda"]
         asked = wp.array(np.asarray(asked, np.int32), dtype=wp.vec2i, device=device)
-        inputs = [run, wp.float64(most), batch.trees, asked, rows, _sort(points, rows), found]
+        inputs = [run, wp.float64(most), batch.trees, asked, rows, _sort(rows, lower, upper), found]
         wp.launch(kernels.measure_point_kernel, -(-n // run), inputs, device=device, block_dim=64)
-    return tuple(getattr(found, name).numpy() for name in names)
+    return tuple(getattr(found, name) if stays else getattr(found, name).numpy() for name in names)
 
 
-def _check_points(points) -> np.ndarray:
+def _is_on_gpu(points) -> bool:
+    device: Any = points.device if isinstance(points, wp.array) else None
+    return device is not None and device.is_cuda and points.dtype is wp.vec3d and points.ndim == 1
+
+
+def _refuse(i: int, is_finite: bool):
+    what = "has a coordinate beyond 2^300, the most that a mesh may have" if is_finite else "is not finite"
+    raise ValueError(f"points: point {i} {what}")
+
+
+def _bound_on_host(points, device) -> tuple:
+    """Return points as an array of the device, and the corners of their box; raise ValueError for bad ones."""
     points = to_numpy(points, "points")
     if points.shape == (0,):
-        return np.empty((0, 3))
+        points = np.empty((0, 3))
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "iuf":
         raise ValueError(f"points: shape {points.shape} and type {points.dtype}, not numbers of shape (n, 3)")
     points = np.ascontiguousarray(points, np.float64)
     if not np.abs(points).max(initial=0.0) <= COORDINATE_MAX:
-        for what, sound in (("is not finite", np.isfinite(points)), (TOO_FAR, np.abs(points) <= COORDINATE_MAX)):
-            if not sound.all():
-                raise ValueError(f"points: point {sound.all(1).argmin()} {what}")
-    return points
-
-
-def _sort(points, rows) -> wp.array:
-    """Return indices of points along a Morton curve through their box."""
+        finite, near = np.isfinite(points).all(1), (np.abs(points) <= COORDINATE_MAX).all(1)
+        _refuse(near.argmin() if finite.all() else finite.argmin(), finite.all())
     # NumPy takes ten times as long along the first axis.
-    lower = np.array([column.min() for column in points.T])
-    cell = max(column.max() - low for column, low in zip(points.T, lower)) / 2 ** int(kernels.CODE_BITS)
-    code, order = (wp.empty(2 * len(points), dtype=wp.int32, device=rows.device) for _ in range(2))
-    inputs = [wp.vec3d(*lower), wp.float64(float(cell) or 1.0), rows, code, order]
-    wp.launch(kernels.code_point_kernel, len(points), inputs, device=rows.device)
-    radix_sort(code, order, len(points), 32)
+    corners = np.array([(column.min(), column.max()) for column in points.T]) if len(points) else np.zeros((3, 2))
+    return wp.array(points, dtype=wp.vec3d, device=device), *corners.T
+
+
+def _bound_on_gpu(points: wp.array) -> tuple:
+    """Return the same of points that are there. Waits for the device."""
+    limits = np.repeat([np.inf, -np.inf, np.inf], (3, 3, 1))
+    bounds = wp.array(limits, dtype=wp.float64, device=points.device)
+    inputs = [BOUND_THREADS, wp.float64(COORDINATE_MAX), points, bounds]
+    wp.launch(kernels.bound_point_kernel, BOUND_THREADS, inputs, device=points.device)
+    limits = bounds.numpy()
+    if np.isfinite(limits[6]):
+        bad = int(limits[6])
+        _refuse(bad, np.isfinite(points[bad : bad + 1].numpy()).all())
+    return points, limits[:3], limits[3:6]
+
+
+def _sort(rows: wp.array, lower, upper) -> wp.array:
+    """Return indices of points along a Morton curve through their box."""
+    cell = float((upper - lower).max()) / 2 ** int(kernels.CODE_BITS)
+    code, order = (wp.empty(2 * len(rows), dtype=wp.int32, device=rows.device) for _ in range(2))
+    inputs = [wp.vec3d(*lower), wp.float64(cell or 1.0), rows, code, order]
+    wp.launch(kernels.code_point_kernel, len(rows), inputs, device=rows.device)
+    radix_sort(code, order, len(rows), 32)
     return order
 
 

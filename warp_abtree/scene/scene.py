@@ -178,7 +178,8 @@ class Scene(PosedObjects):
         nearest surface, at the objects' LODs.
 
         Args:
-            points: (n, 3) [world units], of any framework.
+            points: (n, 3) [world units], of any framework. A Warp array of vec3d on the scene's GPU stays there, and so
+                do the results, Warp arrays of their own.
             world: The objects of which world are asked, those of world -1 among them.
             signed: Whether the insides of solids count.
             within: Distance [world units] up to which surfaces are looked for, which takes less time: of points farther

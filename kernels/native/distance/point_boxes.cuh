@@ -2,9 +2,10 @@
 #pragma once
 #include "builtin.h"
 
-inline CUDA_CALLABLE void open_node(wp::array_t<wp::vec4> boxes, wp::int32 at, wp::vec3d x, wp::vec2d& squares,
-                                    wp::vec2i& codes) {
-    const float* const records = (const float*)(boxes.data + 2 * (wp::int64)at);
+inline CUDA_CALLABLE void open_node(wp::array_t<wp::vec4> boxes, wp::int32 start, wp::int32 node, wp::vec3d x,
+                                    wp::vec2d& squares, wp::vec2i& codes) {
+    const float* const tree = (const float*)(boxes.data + 2 * (wp::int64)start);
+    const float* const records = tree + 16 * (wp::int64)node;
     for (int k = 0; k < 2; ++k) {
         const float *const lower = records + 8 * k, *const upper = lower + 4;
 #if defined(__CUDA_ARCH__)
@@ -27,6 +28,7 @@ inline CUDA_CALLABLE void open_node(wp::array_t<wp::vec4> boxes, wp::int32 at, w
         const wide square = gap * gap;
         const double total = (square[0] + square[1]) + square[2];
         const int skip = ((const int*)lower)[3], face = ((const int*)upper)[3];
+        __builtin_prefetch(tree + 16 * (wp::int64)(face >= 0 || skip < 0 ? 0 : skip));
 #endif
         squares[k] = skip < 0 ? (double)INFINITY : total;
         codes[k] = face >= 0 ? ~face : skip;

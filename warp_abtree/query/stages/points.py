@@ -213,8 +213,8 @@ class ManifoldQuery(Operator):
 
     Args:
         scene, pairs, precision, gap: As for `ContactQuery`.
-        capacity: `Buffers`, or the hits that there is room for: contacts of faces that cross, and witnesses. Where `run`
-            and `grow` would need long lists, parts of the pairs take turns in shorter ones (`query.point_parts`).
+        capacity: `Buffers`, or the hits that there is room for: contacts of faces that cross, and witnesses. Where
+            `run` would need long lists, parts of the pairs take turns in shorter ones (`query.point_parts`).
         points: Most points of a pair, 1 to 64. A pair has fewer where these hold against all twists.
         remember: How far [world units] the points of a pair's smaller object may move, as the other one sees it, until
             the pair is searched again: while it rests it keeps the points of its last search, moved with the objects,
