@@ -164,3 +164,24 @@ def test_bodies_move_alike_in_parts(device, monkeypatch):
     assert not parted
     shorten_lists(monkeypatch, 300, 300)
     assert fall() == (whole, True)
+
+
+@pytest.mark.usefixtures("regime")
+def test_parts_whose_growth_was_interrupted_are_linked_by_the_next_run(device, monkeypatch):
+    """The query has the lists of its parts, and no graph of before, wherever they were about to be lent."""
+    scene, poses, query = ask_in_parts(device, monkeypatch)
+    poses[:, :3] *= 0.8
+    scene.set_poses(poses)
+    whole, link, before = query._link_parts, [KeyboardInterrupt], query.guard.buffers.number
+
+    def interrupted():
+        raise link.pop()
+
+    monkeypatch.setattr(query, "_link_parts", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        query.run()
+    assert query.guard.buffers.number > before
+    monkeypatch.setattr(query, "_link_parts", whole)
+    query.run()
+    operator = query.parts.operator
+    assert query.faces is operator.faces and len(query.hits.face) == query.list_rooms.hits

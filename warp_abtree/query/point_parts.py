@@ -63,7 +63,7 @@ class PointParts:
             min(hits, HITS_AT_ONCE), -(-query.rooms.pairs // parts), min(uncertain, UNCERTAIN_AT_ONCE) or None
         )
         self._gaps = next((stage for stage in stages if isinstance(stage, PartGaps)), None)
-        self._points = stages[-1]
+        self._points, self._lent = stages[-1], -1  # generation of the lists that the query has
         # Its pairs are written on the device.
         self.operator = Operator(query.batch, stages, np.array([[0, 1]], np.int32), rooms, "faces")
 
@@ -72,15 +72,15 @@ class PointParts:
         return {name: getattr(self.operator.rooms, name) for name in ("hits", "uncertain")}
 
     def fit_states(self) -> bool:
-        """Make room for tree states that are new; return whether that took new arrays."""
-        before = self.operator.guard.buffers.number
+        """Make room for tree states that are new; return whether the lists are others than were lent last."""
         self.operator.fit_states()
-        return self.operator.guard.buffers.number != before
+        return self.operator.guard.buffers.number != self._lent
 
     def lend_lists(self, hits: Any):
         """Let hits of the query have the lists of the parts, whose totals it then has."""
         for name in ("face", "uncertain", "inexact", "apart"):
             setattr(hits, name, getattr(self.operator.hits, name))
+        self._lent = self.operator.guard.buffers.number
 
     def make_room(self, hits: int | None, uncertain: int | None):
         """Make room for longer lists of a part, or where these are long enough, make parts of half of the pairs."""

@@ -294,6 +294,7 @@ class ManifoldQuery(Operator):
         """Make room for longer lists; those beyond some length serve parts of the pairs, one after the other."""
         some = None if hits is None else hits // self.growth * 5 // 4  # of lists that are long
         if self.parts is not None:
+            self.guard.buffers.advance()
             self.parts.make_room(some, uncertain)
         elif needs_parts(self.rooms.pairs, some or 0, uncertain or 0):
             gap = None if self.hits.gap is None else PartGaps()
