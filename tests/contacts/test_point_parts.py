@@ -150,14 +150,20 @@ def test_parts_are_in_graphs(monkeypatch):
         query.result()
 
 
-def test_bodies_move_alike_in_parts(device, monkeypatch):
+@pytest.mark.parametrize("by_frames", [False, True], ids=["steps", "frames"])
+@pytest.mark.usefixtures("regime")
+def test_bodies_move_alike_in_parts(device, monkeypatch, by_frames):
     """A heap falls to the same bytes, whatever the lists."""
 
     def fall():
         scene, _poses = grid(device, solids=True)
         bodies = ab.Dynamics(scene, capacity=ab.Buffers(100, None, 100))
+        frame = ab.Frame(scene, bodies.motion(), time_step=0.01)
         for _ in range(6):
-            bodies.step(0.01)
+            if by_frames:
+                frame.step()
+            else:
+                bodies.step(0.01)
         return scene.poses.tobytes(), bodies.query.parts is not None
 
     whole, parted = fall()

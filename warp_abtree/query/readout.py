@@ -24,11 +24,6 @@ COLUMN_NAMES = "count", *COUNTERS
 HEADER, COLUMNS = int(kernels.HEADER_WORDS), int(kernels.COUNT_COLUMNS)
 
 
-def waiting_demand(operator: Any, apart: int, uncertain: int) -> int:
-    """Return the room that an operator's lists need for face pairs that are apart, and that are uncertain."""
-    return max(apart, uncertain * (APART_FOR_UNCERTAIN if operator.lists_apart else 1))
-
-
 def operator_kernels(device, stages, output: str) -> list:
     """Return the kernels of the first launch of an operator with these stages, as `loading` takes them."""
     regime = current_regime()
@@ -119,11 +114,11 @@ class Readout:
         """Read what the last launch needed of each list. Waits for the device."""
         operator = self.operator
         if self.packs:
-            return self._totals(self.staging.fetch_words(self._pack_pairs(0), HEADER))
+            return self.totals(self.staging.fetch_words(self._pack_pairs(0), HEADER))
         views, hits = self.views, operator.hits
         apart, witnesses = self._read_count(hits.apart_total), self._read_count(hits.witness_total)
         lists = int(views.counts[0].sum()), int(views.counts[FLOAT64_ROW].sum()), apart, witnesses
-        return self._totals([operator.guard.outcome(), int(views.pair_count[0]), *lists])
+        return self.totals([operator.guard.outcome(), int(views.pair_count[0]), *lists])
 
     def read_demand(self) -> Found:
         """Read `read_totals` alone of what was found. Waits for the device."""
@@ -134,15 +129,16 @@ class Readout:
         """Return a counter, read as uint32; 0 where there is none. Waits for the device."""
         return 0 if count is None else int(count.numpy().view(np.uint32)[0])
 
-    def _totals(self, header) -> Totals:
+    def totals(self, header) -> Totals:
         """Return the demands in a header; those of lists that the operator lacks are 0."""
         launched, found, total, uncertain, apart, witnesses = map(int, header[:HEADER])
         operator, hits = self.operator, self.operator.hits
         if operator.parts is not None:  # the lists have held those of one part at a time
             total, uncertain = self._read_count(hits.total), self._read_count(hits.uncertain_total)
         pairs = len(operator.given) if operator.broad_phase is None else operator.broad_phase.check_found(found)
-        demand = waiting_demand(operator, apart, uncertain) if operator.list_rooms.uncertain else 0
-        return Totals(launched, pairs, max(total, witnesses) if operator.output == "faces" else 0, demand)
+        waiting = max(apart, uncertain * (APART_FOR_UNCERTAIN if operator.lists_apart else 1))
+        waiting = waiting if operator.list_rooms.uncertain else 0
+        return Totals(launched, pairs, max(total, witnesses) if operator.output == "faces" else 0, waiting)
 
     def read_pairs(self, device: bool) -> Found:
         """Read demands, and what there is an entry a pair of. Waits for the device."""
@@ -197,7 +193,7 @@ class Readout:
             pairs, end = words[end : end + n].view(np.int32).reshape(n, 2), end + n
         flags = words[end:].view(bool)
         apart = None if operator.near is None else flags[n : 2 * n]
-        found = Found(pairs, flags[:n], apart, **dict(zip(COLUMN_NAMES, columns)), totals=self._totals(words))
+        found = Found(pairs, flags[:n], apart, **dict(zip(COLUMN_NAMES, columns)), totals=self.totals(words))
         self._last_read = n, found.totals.hits
         if rows is not None and found.totals.hits <= len(rows):
             found.faces = rows[: found.totals.hits]
@@ -216,7 +212,7 @@ class Readout:
         """Return arrays on the device, parts of a block of their own."""
         operator = self.operator
         block = wp.empty(self._block_length(n), dtype=wp.int64, device=self.device)
-        totals = self._totals(self.staging.fetch_words(self._pack_pairs(n, block), HEADER))
+        totals = self.totals(self.staging.fetch_words(self._pack_pairs(n, block), HEADER))
 
         def part(at, dtype):
             return view_memory(block.ptr + at, dtype, n, self.device, block)

@@ -15,7 +15,6 @@ from warp_abtree.kernels.lod.ladder import WARP
 from warp_abtree.kernels.lod.prediction import LevelChoice
 from warp_abtree.kernels.update.levels import Levels
 from warp_abtree.lod.controllers import Controller
-from warp_abtree.query.readout import waiting_demand
 from warp_abtree.query.stages.contacts import ContactQuery
 from warp_abtree.query.stages.intersect import Query
 from warp_abtree.scene.scene import Scene
@@ -215,10 +214,6 @@ class FrameStages:
 
     def has_room(self, found: dict) -> bool:
         """Return whether all buffers had room for what a frame has found, of which this is the summary."""
-        query, room = self.query, self.query.list_rooms.uncertain
-        return (
-            found["launched"] >= 0
-            and 0 <= found["pairs"] <= len(query.pairs)
-            and (query.output != "faces" or max(found["hits"], found["witnesses"]) <= len(query.hits.face))
-            and (not room or waiting_demand(query, found["apart"], found["uncertain"]) <= room)
-        )
+        query, names = self.query, ("launched", "pairs", "hits", "uncertain", "apart", "witnesses")
+        launched, *needed = query.readout.totals([found[name] for name in names])
+        return launched >= 0 and all(need <= room for need, room in zip(needed, query.list_rooms))
