@@ -131,6 +131,16 @@ def test_more_pairs_than_before_are_more_parts(device, monkeypatch):
     assert bytes_of(found) == bytes_of(ab.ManifoldQuery(scene, gap=GAP).run())
 
 
+def test_objects_that_were_removed_are_in_no_part(device, monkeypatch):
+    """Whichever these are, the first two too."""
+    scene, _poses = grid(device)
+    scene.remove([0, 1])
+    whole = bytes_of(ab.ManifoldQuery(scene, gap=GAP).run())
+    shorten_lists(monkeypatch)
+    query = ab.ManifoldQuery(scene, None, ab.Buffers(100, None, 100), gap=GAP)
+    assert bytes_of(query.run()) == whole and query.parts is not None
+
+
 def test_parts_are_in_graphs(monkeypatch):
     """A captured launch replays at other poses; one from before the lists grew has no result."""
     if not wp.is_cuda_available():

@@ -65,7 +65,7 @@ class PointParts:
         self._gaps = next((stage for stage in stages if isinstance(stage, PartGaps)), None)
         self._points, self._lent = stages[-1], -1  # generation of the lists that the query has
         # Its pairs are written on the device.
-        self.operator = Operator(query.batch, stages, np.array([[0, 1]], np.int32), rooms, "faces")
+        self.operator = Operator(query.batch, stages, np.empty((0, 2), np.int32), rooms, "faces")
 
     def list_rooms(self) -> dict[str, int]:
         """Return the room of the lists by name."""
