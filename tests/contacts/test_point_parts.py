@@ -141,6 +141,16 @@ def test_objects_that_were_removed_are_in_no_part(device, monkeypatch):
     assert bytes_of(query.run()) == whole and query.parts is not None
 
 
+@pytest.mark.usefixtures("regime")
+def test_a_list_of_parts_may_be_shorter_than_that_of_the_query(device, monkeypatch):
+    """Where hits are too many for one list, what waits has room in its list, but perhaps not in that of a part."""
+    scene, _poses = grid(device)
+    whole = bytes_of(ab.ManifoldQuery(scene, gap=GAP).run())
+    shorten_lists(monkeypatch, 60, 500)
+    query = ab.ManifoldQuery(scene, None, ab.Buffers(100, None, 2**17), gap=GAP)
+    assert bytes_of(query.run()) == whole and query.parts is not None
+
+
 def test_parts_are_in_graphs(monkeypatch):
     """A captured launch replays at other poses; one from before the lists grew has no result."""
     if not wp.is_cuda_available():

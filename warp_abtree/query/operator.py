@@ -363,7 +363,7 @@ class Operator(DeviceMemory):
             while found.totals.hits > self.list_rooms.hits:
                 self.make_list_room(hits=self.growth * found.totals.hits)
                 self.search()
-                found = read()
+                found = self._grow_uncertain(read, read())  # parts may have a shorter list
             self.report(found.totals.hits)
         return found
 
