@@ -112,6 +112,11 @@ def visit_half(pair: wp.int32, faces: wp.vec2i, trees: Trees, pose: PairPose, ow
         return True
 
 
+@wp.func
+def visit_none(pair: wp.int32, faces: wp.vec2i, trees: Trees, pose: PairPose, own: LeastDistance):
+    return None
+
+
 @wp.func_native("own.least[pair] = 0;")
 def visit_native(pair: wp.int32, faces: wp.vec2i, trees: Trees, pose: PairPose, own: LeastDistance): ...
 
@@ -146,6 +151,7 @@ def test_takes_what_returns_on_all_ways(device, visit, hits):
     [
         (visit_without_value, LeastDistance(), "visit_without_value: ends without a value; return a bool"),
         (visit_half, LeastDistance(), "visit_half: ends without a value"),
+        (visit_none, LeastDistance(), "visit_none: ends without a value"),
         (visit_native, LeastDistance(), "visit_native: ends without a value"),
         (lambda *given: True, LeastDistance(), "visit: a Warp function .* not a function"),
         (visit_less, LeastDistance(), r"visit_less: takes \(pair, faces\), not \(pair, faces, trees, pose, own\)"),

@@ -56,8 +56,8 @@ def _check_visit(visit, own):
 def _returns(body) -> bool:
     """Return whether each way through a block returns a value."""
     for line in body:
-        if isinstance(line, ast.Return) and line.value is not None:
-            return True
+        if isinstance(line, ast.Return):
+            return ast.unparse(line) not in ("return", "return None")
         if isinstance(line, ast.If) and _returns(line.body) and _returns(line.orelse):
             return True
         if isinstance(line, ast.While) and isinstance(line.test, ast.Constant):
