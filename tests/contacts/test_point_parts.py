@@ -85,7 +85,7 @@ def test_parts_find_the_same_bytes(device, monkeypatch, name, solids, given):
 
     whole, parted, query = both(monkeypatch, make, 3)
     assert whole == parted
-    assert query.parts is not None and query.parts.operator.rooms.pairs < query.rooms.pairs
+    assert query.parts is not None and query.parts.count > 1
 
 
 def ask_in_parts(device, monkeypatch, **options):
@@ -101,17 +101,17 @@ def ask_in_parts(device, monkeypatch, **options):
 def test_lists_of_parts_that_are_too_short_tell_and_grow(device, monkeypatch):
     """A launch tells what it lacked; a run makes parts smaller until lists suffice, down to one pair."""
     scene, poses, query = ask_in_parts(device, monkeypatch)
-    size, alike = query.parts.operator.rooms.pairs, query.run()
+    parts, alike = query.parts.count, query.run()
     poses[:, :3] *= 0.8
     scene.set_poses(poses)
     query.launch()
     with pytest.raises(ab.CapacityError, match="the query has room for"):
         query.result().check()
     closer = query.run()
-    assert closer.count.sum() > 2 * alike.count.sum() and query.parts.operator.rooms.pairs < size
+    assert closer.count.sum() > 2 * alike.count.sum() and query.parts.count > parts
     shorten_lists(monkeypatch, 10, 10)
     one = ab.ManifoldQuery(scene, None, ab.Buffers(10, None, 10), gap=GAP)
-    assert bytes_of(one.run()) == bytes_of(closer) and one.parts.operator.rooms.pairs == 1
+    assert bytes_of(one.run()) == bytes_of(closer) and one.parts.count == len(closer.pairs)
     assert len(one.hits.face) >= closer.count.max()
 
 

@@ -51,16 +51,18 @@ class PointParts:
     Args:
         query: `ManifoldQuery` whose lists are too short.
         stages: Of the operator, those of a query with gaps of its own.
+        pairs: That there are.
         hits, uncertain: Entries that the query's lists would need.
 
     Attributes:
         operator: The operator, whose lists hold those of the last part.
+        count: How many parts the pairs are divided into, as many as there are in a launch, evenly.
     """
 
-    def __init__(self, query: Any, stages: list[Any], hits: int, uncertain: int):
-        parts = max(-(-hits // HITS_AT_ONCE), -(-uncertain // UNCERTAIN_AT_ONCE))
+    def __init__(self, query: Any, stages: list[Any], pairs: int, hits: int, uncertain: int):
+        self.count = min(pairs, max(-(-hits // HITS_AT_ONCE), -(-uncertain // UNCERTAIN_AT_ONCE)))
         rooms = Buffers(
-            min(hits, HITS_AT_ONCE), -(-query.rooms.pairs // parts), min(uncertain, UNCERTAIN_AT_ONCE) or None
+            min(hits, HITS_AT_ONCE), -(-query.rooms.pairs // self.count), min(uncertain, UNCERTAIN_AT_ONCE) or None
         )
         self._gaps = next((stage for stage in stages if isinstance(stage, PartGaps)), None)
         self._points, self._lent = stages[-1], -1  # generation of the lists that the query has
@@ -82,17 +84,26 @@ class PointParts:
             setattr(hits, name, getattr(self.operator.hits, name))
         self._lent = self.operator.guard.buffers.number
 
-    def make_room(self, hits: int | None, uncertain: int | None):
-        """Make room for longer lists of a part, or where these are long enough, make parts of half of the pairs."""
+    def fit_pairs(self, pairs: int):
+        """Make room for parts of so many pairs that a query has room for."""
+        if -(-pairs // self.count) > self.operator.rooms.pairs:
+            self.operator.make_room(pairs=-(-pairs // self.count))
+
+    def make_room(self, pairs: int, hits: int | None, uncertain: int | None):
+        """Make room for longer lists of a part, or where these are long enough, make twice as many parts.
+
+        Args:
+            pairs: That there are; a part of one has lists as long as it takes.
+        """
         rooms, most = self.operator.rooms, {"hits": HITS_AT_ONCE, "uncertain": UNCERTAIN_AT_ONCE}
         wanted = {name: room for name, room in (("hits", hits), ("uncertain", uncertain)) if room is not None}
         within = {name: max(getattr(rooms, name), min(room, most[name])) for name, room in wanted.items()}
-        if rooms.pairs == 1:
+        if self.count >= pairs:
             self.operator.make_room(**wanted)
         elif any(within[name] > getattr(rooms, name) for name in wanted):
             self.operator.make_room(**within)
         else:
-            self.operator.make_room(pairs=-(-rooms.pairs // 2))
+            self.count = min(2 * self.count, pairs)
 
     def launch(self, query: Any, asked: Any):
         """Find the contact points of all pairs that a query has room for. Launches only.
@@ -104,18 +115,20 @@ class PointParts:
         operator, size, gaps = self.operator, self.operator.rooms.pairs, self._gaps
         none, record = wp.empty(0, dtype=wp.float64, device=operator.device), query.guard.record()
         gap, own = (none, (none, none)) if gaps is None else (query.hits.gap, (operator.hits.gap, gaps.asked))
-        taken = query.pair_batch, gap, none if asked is None else asked, query.hits, operator.pair_batch, *own
-        put = operator.pair_batch, operator.hits, self._points.manifolds, query.hits, query.manifolds
+        whole = query.hits, query.manifolds
+        taken = query.pair_batch, gap, none if asked is None else asked, *whole, operator.pair_batch, *own
+        put = query.pair_batch, operator.hits, self._points.manifolds, *whole
 
-        def launch(kernel, first, dim, inputs):
+        def launch(kernel, k, dim, inputs):
             def make(launch):
-                return [launch(kernel, dim=dim, inputs=inputs, device=operator.device)]
+                inputs_of_part = [wp.vec2i(k, self.count), *inputs]
+                return [launch(kernel, dim=dim, inputs=inputs_of_part, device=operator.device)]
 
-            for command in operator.find_launches(f"{kernel.key} {first}", make, query.guard.given()):
+            for command in operator.find_launches(f"{kernel.key} {k}", make, query.guard.given(), self.count):
                 command()
 
-        for first in range(0, query.rooms.pairs, size):
-            launch(kernels.take_part_kernel, first, size, [first, record, *taken])
+        for k in range(self.count):
+            launch(kernels.take_part_kernel, k, size if k else query.rooms.pairs, [record, *taken])
             operator.search()
             operator.report()
-            launch(kernels.put_part_kernel, first, (size, query.point_max), [first, *put])
+            launch(kernels.put_part_kernel, k, (size, query.point_max), put)

@@ -291,16 +291,17 @@ class ManifoldQuery(Operator):
         return self.rooms if self.parts is None else self.rooms._replace(**self.parts.list_rooms())
 
     def make_list_room(self, hits=None, uncertain=None):
-        """Make room for longer lists; those beyond some length serve parts of the pairs, one after the other."""
+        """Make room for longer lists; those beyond some length serve parts of the pairs in turn. Waits for the device."""
         some = None if hits is None else hits // self.growth * 5 // 4  # of lists that are long
+        pairs = int(self.pair_count.numpy()[0])
         if self.parts is not None:
             self.guard.buffers.advance()
-            self.parts.make_room(some, uncertain)
-        elif needs_parts(self.rooms.pairs, some or 0, uncertain or 0):
+            self.parts.make_room(pairs, some, uncertain)
+        elif needs_parts(pairs, some or 0, uncertain or 0):
             gap = None if self.hits.gap is None else PartGaps()
             surfaces = None if self._originals is None else OriginalStage(self._originals.finest)
             stages = self._plan(gap, None if self.memory is None else gap, None, surfaces)
-            self.parts = PointParts(self, stages, some or self.rooms.hits, uncertain or self.rooms.uncertain)
+            self.parts = PointParts(self, stages, pairs, some or self.rooms.hits, uncertain or self.rooms.uncertain)
         else:
             super().make_list_room(hits, uncertain)
             return
@@ -313,6 +314,11 @@ class ManifoldQuery(Operator):
             self.parts.lend_lists(self.hits)
             self._name_arrays(self.parts.operator.stages)
             self.faces, self.start = self.parts.operator.faces, self.parts.operator.start
+
+    def _make(self, rooms: Rooms) -> list:
+        if self.parts is not None:
+            self.parts.fit_pairs(rooms.pairs)
+        return super()._make(rooms)
 
     def _replace(self, made, rooms: Rooms):
         super()._replace(made, rooms)
