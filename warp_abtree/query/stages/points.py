@@ -291,7 +291,7 @@ class ManifoldQuery(Operator):
         return self.rooms if self.parts is None else self.rooms._replace(**self.parts.list_rooms())
 
     def make_list_room(self, hits=None, uncertain=None):
-        """Make room for longer lists; those beyond some length serve parts of the pairs in turn. Waits for the device."""
+        """Make room for longer lists; long ones serve parts of the pairs in turn. Waits for the device."""
         some = None if hits is None else hits // self.growth * 5 // 4  # of lists that are long
         pairs = int(self.pair_count.numpy()[0])
         if self.parts is not None:
@@ -302,6 +302,7 @@ class ManifoldQuery(Operator):
             surfaces = None if self._originals is None else OriginalStage(self._originals.finest)
             stages = self._plan(gap, None if self.memory is None else gap, None, surfaces)
             self.parts = PointParts(self, stages, pairs, some or self.rooms.hits, uncertain or self.rooms.uncertain)
+            self.make_room(hits=1, uncertain=min(1, self.rooms.uncertain))  # its own are not used any more
         else:
             super().make_list_room(hits, uncertain)
             return
