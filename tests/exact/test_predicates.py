@@ -215,7 +215,6 @@ def test_the_filter_is_tight(device):
 def unit_of(rows):
     """Return the power of two that a determinant is a whole multiple of, None where a row is 0."""
     *rows, last = [[Fraction(x) for x in row] for row in rows]
-    *rows, last = [[Fraction(x) for x in row] for row in rows]
     used = [[x for x in (*row, *last) if x != 0] for row in rows]
     powers = [[(x.numerator & -x.numerator).bit_length() - x.denominator.bit_length() for x in row] for row in used]
     return sum(map(min, powers)) if all(powers) else None
