@@ -69,8 +69,7 @@ OPTIONS = {
 }
 
 
-@pytest.mark.parametrize("given", [False, True], ids=["broad phase", "given"])
-@pytest.mark.parametrize("solids", [False, True], ids=["surfaces", "solids"])
+@pytest.mark.parametrize(("solids", "given"), [(False, False), (True, True)], ids=["surfaces", "solids of given pairs"])
 @pytest.mark.parametrize("name", OPTIONS)
 @pytest.mark.usefixtures("regime")
 def test_parts_find_the_same_bytes(device, monkeypatch, name, solids, given):
