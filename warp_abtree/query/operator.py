@@ -167,8 +167,9 @@ class Operator(DeviceMemory):
         return self.rooms
 
     def make_list_room(self, hits: int | None = None, uncertain: int | None = None):
-        """Make room for longer lists, as `make_room`."""
-        self.make_room(hits=hits, uncertain=uncertain)
+        """Make room for lists of which so much was needed, and some to spare."""
+        spare = None if hits is None else self.growth * hits
+        self.make_room(hits=spare, uncertain=None if uncertain is None else more_room(uncertain))
 
     def _replace(self, made: list, rooms: Rooms):
         """Put new arrays, (owner, attribute, array), in the place of old ones."""
@@ -361,7 +362,7 @@ class Operator(DeviceMemory):
                 found = read()
             found = self._grow_uncertain(read, found)
             while found.totals.hits > self.list_rooms.hits:
-                self.make_list_room(hits=self.growth * found.totals.hits)
+                self.make_list_room(hits=found.totals.hits)
                 self.search()
                 found = self._grow_uncertain(read, read())  # parts may have a shorter list
             self.report(found.totals.hits)
@@ -376,7 +377,7 @@ class Operator(DeviceMemory):
     def _grow_uncertain(self, read, found: Found) -> Found:
         # How many wait varies for `any`, where the first hit of a pair ends its traversal.
         while 0 < self.list_rooms.uncertain < min(LIST_MAX, found.totals.uncertain):
-            self.make_list_room(uncertain=more_room(found.totals.uncertain))
+            self.make_list_room(uncertain=found.totals.uncertain)
             self.search()
             found = read()
         return found

@@ -66,6 +66,7 @@ class PointParts:
         )
         self._gaps = next((stage for stage in stages if isinstance(stage, PartGaps)), None)
         self._points, self._lent = stages[-1], -1  # generation of the lists that the query has
+        self._none = wp.empty(0, dtype=wp.float64, device=query.device)  # gaps where there are none
         # Its pairs are written on the device.
         self.operator = Operator(query.batch, stages, np.empty((0, 2), np.int32), rooms, "faces")
 
@@ -106,14 +107,14 @@ class PointParts:
             self.count = min(2 * self.count, pairs)
 
     def launch(self, query: Any, asked: Any):
-        """Find the contact points of all pairs that a query has room for. Launches only.
+        """Find the contact points of all pairs of a query. Launches only.
 
         Args:
             query: The query.
             asked: What the traversal takes for gaps, device float64 (pair,); None for the gaps.
         """
         operator, size, gaps = self.operator, self.operator.rooms.pairs, self._gaps
-        none, record = wp.empty(0, dtype=wp.float64, device=operator.device), query.guard.record()
+        none, record = self._none, query.guard.record()
         gap, own = (none, (none, none)) if gaps is None else (query.hits.gap, (operator.hits.gap, gaps.asked))
         whole = query.hits, query.manifolds
         taken = query.pair_batch, gap, none if asked is None else asked, *whole, operator.pair_batch, *own

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.upload import Download, Upload
-from warp_abtree.kernels.io import pipeline as arranging
+from warp_abtree.kernels.io import pipeline as pipeline_kernels
 from warp_abtree.kernels.lod import frame_summary
 from warp_abtree.kernels.lod.ladder import WARP
 from warp_abtree.kernels.lod.prediction import LevelChoice
@@ -108,7 +108,7 @@ class FrameStages:
         """Load the kernels that no other operator has loaded, and make room for what is found; nothing moves."""
         if self._stepped is not None:
             self._stepped.warm_up(self._time_step)
-        for module in (frame_summary, arranging):
+        for module in (frame_summary, pipeline_kernels):
             wp.load_module(module, self.device)
         if self._levels is not None:
             self._levels.load()
@@ -170,7 +170,7 @@ class FrameStages:
             chosen = LevelChoice() if controller is None else controller.chosen
             poses = self._rows if places else self._rows[:0]
             inputs = [poses, chosen, levels, self.batch.objects.pool, self._tests]
-            wp.launch(arranging.arrange_object_kernel, len(self._rows), inputs, device=self.device)
+            wp.launch(pipeline_kernels.arrange_object_kernel, len(self._rows), inputs, device=self.device)
         self._mark("move_ms", lambda: {"posed": 0 if self.motion is None else self.scene.object_count})
 
     def find(self):

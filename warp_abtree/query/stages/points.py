@@ -53,6 +53,7 @@ from warp_abtree.kernels.contacts import points as point_kernels
 from warp_abtree.kernels.inside import inside_points, nearest_contacts
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.point_parts import PartGaps, PointParts, needs_parts
+from warp_abtree.query.request import more_room
 from warp_abtree.query.result import VECTORS, Found, Result
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
 from warp_abtree.query.stages.contacts import ContactStage, plan_contacts, warn_of_winding
@@ -292,16 +293,18 @@ class ManifoldQuery(Operator):
 
     def make_list_room(self, hits=None, uncertain=None):
         """Make room for longer lists; long ones serve parts of the pairs in turn. Waits for the device."""
-        some = None if hits is None else hits // self.growth * 5 // 4  # of lists that are long
+        needed = None if hits is None else hits + hits // 4, None if uncertain is None else more_room(uncertain)
         pairs = int(self.pair_count.numpy()[0])
         if self.parts is not None:
             self.guard.buffers.advance()
-            self.parts.make_room(pairs, some, uncertain)
-        elif needs_parts(pairs, some or 0, uncertain or 0):
+            self.parts.make_room(pairs, *needed)
+        elif needs_parts(pairs, needed[0] or 0, needed[1] or 0):
             gap = None if self.hits.gap is None else PartGaps()
             surfaces = None if self._originals is None else OriginalStage(self._originals.finest)
             stages = self._plan(gap, None if self.memory is None else gap, None, surfaces)
-            self.parts = PointParts(self, stages, pairs, some or self.rooms.hits, uncertain or self.rooms.uncertain)
+            self.parts = PointParts(
+                self, stages, pairs, needed[0] or self.rooms.hits, needed[1] or self.rooms.uncertain
+            )
             self.make_room(hits=1, uncertain=min(1, self.rooms.uncertain))  # its own are not used any more
         else:
             super().make_list_room(hits, uncertain)
