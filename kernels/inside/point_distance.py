@@ -1,13 +1,15 @@
-"""Signed distances of points from objects, the least of each, in the frame of each object: a thread a run of points.
+"""Signed distances of points from objects, the least of each, in the frame of each object.
 
-Points are sorted along a Morton curve, so that the nearest face of one is a good bound for the next. A point that lies
-nearer to the one before than the surface does lies on the same side; of others the even-odd ray test tells.
+Points are sorted along a Morton curve. A warp measures neighbours at once, a thread of the CPU a run of points, of
+which the nearest face of one is a good bound for the next; a point that lies nearer to the one before than the surface
+does lies on the same side. Of others the even-odd ray test tells.
 """
 
 import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees, no_vector
+from warp_abtree.kernels.base.lanes import warp_any, warp_max
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.inside.nearest_face import (
@@ -18,12 +20,21 @@ from warp_abtree.kernels.inside.nearest_face import (
     point_weights,
     square_outside,
 )
+from warp_abtree.kernels.inside.nearest_search import nearest_faces_of_warp
 from warp_abtree.kernels.inside.parity import is_inside, load_posed_face
 from warp_abtree.kernels.intersect.box_tiles import spread_bits
 from warp_abtree.kernels.triangle.distance import largest_coordinate
 from warp_abtree.kernels.triangle.triangle_pair import PAIR_ROUNDING
 
 MODULE_OPTIONS = native.options("distance/point_boxes.cuh", "exact/determinant.cuh")
+WARP_OPTIONS = native.options(
+    "base/lanes.cuh",
+    "distance/point_boxes.cuh",
+    "exact/determinant.cuh",
+    "inside/point_slots.cuh",
+    "search/load_balance.cuh",
+    "search/nearest_stack.cuh",
+)
 wp.set_module_options(MODULE_OPTIONS)
 
 # Bits of a Morton code along each axis.
@@ -77,20 +88,6 @@ def code_point_kernel(
     order_out[i] = i
 
 
-@wp.func
-def solid_about(trees: Trees, pose: PairPose, centre: wp.vec3d, point: wp.vec3d):
-    """Return the `Solid` of an object in its own frame, with the rounding of distances from a point."""
-    root = load_node(trees.states, pose.node_a + 1)
-    size = wp.length(wp.vec3d(root.upper)) + wp.length(wp.vec3d(root.lower))
-    solid = Solid()
-    solid.node = pose.node_a
-    solid.centre = centre
-    solid.slack = PAIR_ROUNDING * (size + largest_coordinate(centre) + largest_coordinate(point))
-    solid.margin = wp.float64(2.0) * solid.slack
-    solid.grow = BOX_GROW
-    return solid
-
-
 @wp.struct
 class PointDistances:
     """What points are given; all arrays of shape [point]."""
@@ -99,6 +96,27 @@ class PointDistances:
     object: wp.array(dtype=wp.int32)  # -1 for none
     face: wp.array(dtype=wp.int32)  # -1 where it is farther than asked
     nearest: wp.array(dtype=wp.vec3d)  # on that face, or NaN
+
+
+@wp.struct
+class PointAnswer:
+    """The least distance of a point so far."""
+
+    least: wp.float64  # [world units], negative inside
+    object: wp.int32  # NO_NEAREST for none
+    face: wp.int32  # NO_NEAREST where it is farther than asked
+
+
+@wp.struct
+class PlacedPoint:
+    """A point in the frame of an object."""
+
+    point: wp.vec3d  # there
+    centre: wp.vec3d  # of the object's model
+    pose: PairPose  # the object as A of a pair
+    solid: Solid  # the object
+    outside: wp.float64  # square of the distance from the object's box
+    far: wp.float64  # no surface of the object is farther
 
 
 @wp.struct
@@ -113,17 +131,6 @@ class LastPoint:
 
 
 @wp.func
-def place_on_face(trees: Trees, pose: PairPose, o: wp.int32, face: wp.int32, point: wp.vec3d):
-    """Return the point of an object's face that is nearest to a point of its frame, world frame; NaN without a face."""
-    if face == NO_NEAREST:
-        return no_vector()
-    a, b, c = load_posed_face(trees, pose, False, face)
-    features, _size = point_features(a, b, c, point)
-    w = point_weights(features)
-    return trees.objects.rotation[o] * ((w[0] * a + w[1] * b) + w[2] * c) + trees.objects.position[o]
-
-
-@wp.func
 def pose_alone(trees: Trees, o: wp.int32):
     """Return where the arrays of an object's state lie, as those of A of a pair."""
     state = trees.objects.state[o]
@@ -131,6 +138,80 @@ def pose_alone(trees: Trees, o: wp.int32):
     pose.node_a = trees.states.node_start[state]
     pose.corner_a = trees.states.face_start[state]
     return pose
+
+
+@wp.func
+def place_point(trees: Trees, o: wp.int32, point: wp.vec3d):
+    """Return a point of the world in an object's frame, with the rounding of distances there."""
+    placed = PlacedPoint()
+    placed.pose = pose_alone(trees, o)
+    placed.centre = trees.models.centre[trees.states.model[trees.objects.state[o]]]
+    placed.point = wp.transpose(trees.objects.rotation[o]) * (point - trees.objects.position[o])
+    root = load_node(trees.states, placed.pose.node_a + 1)
+    size = wp.length(wp.vec3d(root.upper)) + wp.length(wp.vec3d(root.lower))
+    solid = Solid()
+    solid.node = placed.pose.node_a
+    solid.centre = placed.centre
+    solid.slack = PAIR_ROUNDING * (size + largest_coordinate(placed.centre) + largest_coordinate(placed.point))
+    solid.margin = wp.float64(2.0) * solid.slack
+    solid.grow = BOX_GROW
+    placed.solid = solid
+    x = placed.point - placed.centre
+    placed.outside = square_outside(root, x)
+    corner = wp.vec3d()
+    for i in range(3):
+        corner[i] = wp.max(wp.abs(wp.float64(root.lower[i]) - x[i]), wp.abs(wp.float64(root.upper[i]) - x[i]))
+    placed.far = (wp.length(corner) + solid.margin) * solid.grow
+    return placed
+
+
+@wp.func
+def may_be_nearer(placed: PlacedPoint, least: wp.float64):
+    """Return False only where an object neither has the point inside nor is as near."""
+    reach = (wp.max(least, wp.float64(0.0)) + placed.solid.margin) * placed.solid.grow
+    return placed.outside <= reach * reach
+
+
+@wp.func
+def offer_object(answer: wp.ref[PointAnswer], o: wp.int32, inside: bool, distance: wp.float64, face: wp.int32):
+    """Offer an object, and the nearest of its faces, NO_NEAREST for none; return whether it is taken."""
+    signed = wp.where(inside, -distance, distance)
+    if inside and face == NO_NEAREST:
+        signed = -wp.float64(wp.inf)
+    better = signed < answer.least or (signed == answer.least and o < answer.object)
+    better = better and (inside or face != NO_NEAREST)
+    if better:
+        answer.least = signed
+        answer.object = o
+        answer.face = face
+    return better
+
+
+@wp.func
+def report_point(trees: Trees, q: wp.int32, point: wp.vec3d, answer: PointAnswer, found: PointDistances):
+    """Write the answer of a point in the world, and where that lies on its face, where it is asked."""
+    o, face = answer.object, answer.face
+    found.distance[q] = wp.where(o == NO_NEAREST, wp.float64(wp.inf), answer.least)
+    found.object[q] = wp.where(o == NO_NEAREST, -1, o)
+    found.face[q] = wp.where(face == NO_NEAREST, -1, face)
+    if found.nearest.shape[0] > 0:
+        near = no_vector()
+        if face != NO_NEAREST:
+            placed = place_point(trees, o, point)
+            a, b, c = load_posed_face(trees, placed.pose, False, face)
+            features, _size = point_features(a, b, c, placed.point)
+            w = point_weights(features)
+            near = trees.objects.rotation[o] * ((w[0] * a + w[1] * b) + w[2] * c) + trees.objects.position[o]
+        found.nearest[q] = near
+
+
+@wp.func
+def no_answer(within: wp.float64):
+    answer = PointAnswer()
+    answer.least = within
+    answer.object = NO_NEAREST
+    answer.face = NO_NEAREST
+    return answer
 
 
 @wp.kernel(module_options=MODULE_OPTIONS, module="unique")
@@ -158,47 +239,65 @@ def measure_point_kernel(
         if i < points.shape[0]:
             q = order[i]
             first = last.place
-            least, object, nearest = wp.float64(within), wp.int32(NO_NEAREST), wp.int32(NO_NEAREST)
-            near = no_vector()
+            answer = no_answer(within)
             # The object of the point before comes first.
             for j in range(-1, asked.shape[0]):
                 place = wp.where(j < 0, first, j)
                 if place >= 0 and (j < 0 or place != first):
                     o = asked[place][0]
-                    pose = pose_alone(trees, o)
-                    centre = trees.models.centre[trees.states.model[trees.objects.state[o]]]
-                    point = wp.transpose(trees.objects.rotation[o]) * (points[q] - trees.objects.position[o])
-                    solid = solid_about(trees, pose, centre, point)
-                    reach = (wp.max(least, wp.float64(0.0)) + solid.margin) * solid.grow
-                    root = load_node(trees.states, pose.node_a + 1)
-                    meets = square_outside(root, point - centre) <= reach * reach
+                    placed = place_point(trees, o, points[q])
+                    meets = may_be_nearer(placed, answer.least)
                     inside = bool(False)
                     if meets and asked[place][1] != 0:
                         inside = last.inside
-                        if place != last.place or not wp.length(point - last.point) < last.free:
-                            inside = is_inside(trees, pose, False, centre, point)
-                    if meets and (inside or least >= wp.float64(0.0)):
+                        if place != last.place or not wp.length(placed.point - last.point) < last.free:
+                            inside = is_inside(trees, placed.pose, False, placed.centre, placed.point)
+                    if meets and (inside or answer.least >= wp.float64(0.0)):
                         hint = wp.where(place == last.place, last.face, NO_NEAREST)
-                        most = wp.where(inside, within, least)
-                        enough = -wp.float64(1.0)
-                        distance, face = nearest_face_within(trees, pose, solid, point, hint, enough, most)
-                        signed = wp.where(inside, -distance, distance)
-                        if inside and face == NO_NEAREST:
-                            signed = -wp.float64(wp.inf)
-                        better = signed < least or (signed == least and o < object)
-                        better = better and (inside or face != NO_NEAREST)
-                        if better:
-                            least = signed
-                            object = o
-                            nearest = face
-                            near = place_on_face(trees, pose, o, face, point)
+                        most = wp.where(inside, within, answer.least)
+                        distance, face = nearest_face_within(
+                            trees, placed.pose, placed.solid, placed.point, hint, -wp.float64(1.0), most
+                        )
+                        better = offer_object(answer, o, inside, distance, face)
                         if better or last.place < 0 or place == last.place:
                             last.place = place
                             last.face = face
-                            last.point = point
-                            last.free = distance - solid.slack
+                            last.point = placed.point
+                            last.free = distance - placed.solid.slack
                             last.inside = inside
-            found_out.distance[q] = wp.where(object == NO_NEAREST, wp.float64(wp.inf), least)
-            found_out.object[q] = wp.where(object == NO_NEAREST, -1, object)
-            found_out.face[q] = wp.where(nearest == NO_NEAREST, -1, nearest)
-            found_out.nearest[q] = near
+            report_point(trees, q, points[q], answer, found_out)
+
+
+@wp.kernel(module_options=WARP_OPTIONS, module="unique", cuda_max_registers=128)
+def measure_points_of_warp_kernel(
+    within: wp.float64,
+    trees: Trees,
+    asked: wp.array(dtype=wp.vec2i),
+    points: wp.array(dtype=wp.vec3d),
+    order: wp.array(dtype=wp.int32),
+    found_out: PointDistances,
+):
+    """Write what `measure_point_kernel` does, a point a lane."""
+    i = wp.tid()
+    q = order[wp.min(i, points.shape[0] - 1)]
+    answer = no_answer(within)
+    most = wp.float64(within)
+    for j in range(asked.shape[0]):
+        placed = place_point(trees, asked[j][0], points[q])
+        most = wp.min(most, placed.far)
+    for j in range(asked.shape[0]):
+        o = asked[j][0]
+        placed = place_point(trees, o, points[q])
+        placed.solid.margin = warp_max(placed.solid.margin)
+        meets = i < points.shape[0] and may_be_nearer(placed, wp.min(answer.least, most))
+        inside = bool(False)
+        if meets and asked[j][1] != 0:
+            inside = is_inside(trees, placed.pose, False, placed.centre, placed.point)
+        asks = meets and (inside or answer.least >= wp.float64(0.0))
+        if warp_any(asks):
+            limit = wp.where(inside, within, wp.min(answer.least, most))
+            distance, face = nearest_faces_of_warp(trees, placed.pose, placed.solid, asks, placed.point, limit)
+            if asks:
+                offer_object(answer, o, inside, distance, face)
+    if i < points.shape[0]:
+        report_point(trees, q, points[q], answer, found_out)

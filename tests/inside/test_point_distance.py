@@ -13,6 +13,7 @@ from oracles.inside import parity
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
+from warp_abtree import testing
 from warp_abtree.model.mesh import MeshError
 from warp_abtree.scene import point_distance
 
@@ -85,7 +86,7 @@ def test_points_do_not_see_one_another(device, monkeypatch):
     points = np.concatenate([rng.uniform(-1, 1, (300, 3)), np.zeros((3, 3)), rng.uniform(-1e-3, 1e-3, (50, 3))])
     whole = ab.signed_distance(model, points, device=device, nearest=True)
     for run in (1, 7, 1000):
-        monkeypatch.setattr(point_distance, "RUNS", {"cpu": run, "cuda": run})
+        monkeypatch.setattr(point_distance, "RUN", run)
         order = rng.permutation(len(points))
         for part, other in zip(whole, ab.signed_distance(model, points[order], device=device, nearest=True)):
             assert part[order].tobytes() == other.tobytes()
@@ -93,6 +94,26 @@ def test_points_do_not_see_one_another(device, monkeypatch):
         assert ab.signed_distance(model, points[k : k + 1], device=device)[0] == whole[0][k]
     assert ab.signed_distance(model, np.empty((0, 3)), device=device).shape == (0,)
     assert ab.contains(model, np.float32([[0, 0, 0]]), device=device).dtype == bool
+
+
+@pytest.mark.parametrize("within", [None, 0.1])
+def test_warps_and_threads_have_the_same_bits(device, within):
+    """Of a model at two LODs, and of a scene with solids and open objects, far from some of them."""
+    rng, model = np.random.default_rng(5), sample("torus")
+    points = np.concatenate([rng.uniform(-1.5, 1.5, (400, 3)), model.mesh_at(model.lod_max)[0][:70]])
+    scene = ab.Scene(device)
+    for k in range(5):
+        scene.add(sample("small ball"), pose=(0.7 * k - 1.2, 0.1 * k, 0, 0, 0, 0, 1), solid=k % 2 == 0)
+    answers = []
+    for warps in (True, False):
+        with testing.regime(warps=warps):
+            found = [
+                ab.signed_distance(model, points, lod, device, nearest=True, within=within)
+                for lod in (model.lod_max, model.lod_max // 4)
+            ]
+            found.append(scene.signed_distance(points, nearest=True, within=within))
+            answers.append([part.tobytes() for one in found for part in one])
+    assert answers[0] == answers[1]
 
 
 def check_within(whole, part, within):

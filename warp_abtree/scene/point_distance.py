@@ -14,7 +14,9 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, flag, to_numpy, whole_number
 from warp_abtree.checks.radix_sort import radix_sort
+from warp_abtree.checks.regime import current_regime
 from warp_abtree.checks.upload import zeros_of
+from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.inside import point_distance as kernels
 from warp_abtree.model.mesh import COORDINATE_MAX
 from warp_abtree.model.model import Model
@@ -23,8 +25,8 @@ from warp_abtree.query.request import check_within
 from warp_abtree.scene.objects import check_models
 from warp_abtree.scene.posed_objects import PosedObjects
 
-# Points of a thread: the next starts from the last one's nearest face.
-RUNS = {"cpu": 256, "cuda": 1}
+# Points of a thread of the CPU: the next starts from the last one's nearest face.
+RUN = 256
 # Models whose device arrays are kept for the next call.
 KEPT_MODELS = 4
 BOUND_THREADS = 4096
@@ -100,11 +102,16 @@ def _measure(scene, asked, points, within, names) -> tuple:
     rows, lower, upper = _bound_on_gpu(points) if stays else _bound_on_host(points, device)
     n = len(rows)
     found = zeros_of(kernels.PointDistances, n, 0, device)
+    if "nearest" not in names:
+        found.nearest = wp.empty(0, dtype=wp.vec3d, device=device)
     if n:
-        run = RUNS["cpu" if device.is_cpu else "cuda"]
         asked = wp.array(np.asarray(asked, np.int32), dtype=wp.vec2i, device=device)
-        inputs = [run, wp.float64(most), batch.trees, asked, rows, _sort(rows, lower, upper), found]
-        wp.launch(kernels.measure_point_kernel, -(-n // run), inputs, device=device, block_dim=64)
+        inputs = [wp.float64(most), batch.trees, asked, rows, _sort(rows, lower, upper), found]
+        if current_regime().uses_warps(device):
+            threads = -(-n // WARP_SIZE) * WARP_SIZE
+            wp.launch(kernels.measure_points_of_warp_kernel, threads, inputs, device=device, block_dim=WARP_SIZE)
+        else:
+            wp.launch(kernels.measure_point_kernel, -(-n // RUN), [RUN, *inputs], device=device)
     return tuple(getattr(found, name) if stays else getattr(found, name).numpy() for name in names)
 
 

@@ -1,0 +1,134 @@
+"""Nearest faces of an object to the points of a warp, one a lane: a policy of the best-first search.
+
+Nodes and faces of all points share the lists, so that lanes have work while some points take long.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.base.arrays import Trees
+from warp_abtree.kernels.base.boxes import round_down
+from warp_abtree.kernels.base.lanes import next_place, warp_lane, warp_sync
+from warp_abtree.kernels.base.nodes import load_node
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.inside.nearest_face import (
+    NO_NEAREST,
+    Solid,
+    into_frame,
+    open_node,
+    point_distance,
+    square_outside,
+)
+from warp_abtree.kernels.search.best_first import BestFirstPolicy, Entry, SearchLists, best_first, start_lists
+from warp_abtree.kernels.search.item import FACES, NODES, Emitted, item_first, item_second, pack_item
+from warp_abtree.kernels.search.nearest_stack import NEAREST_MEMORY, nearest_stack, write_bounded
+from warp_abtree.kernels.search.warp_stack import STACK_LENGTH
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.struct
+class PointsSearch:
+    """Search for the faces of an object that are nearest to points; items are a node or face, and a point's slot."""
+
+    pose: PairPose  # the object as A or B of it
+    solid: Solid  # the object
+
+
+@native.func_native()
+def put_point(slot: wp.int32, point: wp.vec3d, most: wp.float64, none: wp.int32):
+    """Put a point into a slot, with the distance of faces that count at most, and no face."""
+
+
+@native.func_native()
+def point_of_slot(slot: wp.int32) -> wp.vec3d: ...
+
+
+@native.func_native()
+def least_of_slot(slot: wp.int32) -> wp.float64: ...
+
+
+@native.func_native()
+def face_of_slot(slot: wp.int32) -> wp.int32: ...
+
+
+@native.func_native()
+def offer_point_face(live: bool, slot: wp.int32, distance: wp.float64, face: wp.int32, none: wp.int32):
+    """Offer a face a lane to a slot, which keeps the nearest, the lowest of several. For all lanes."""
+
+
+@wp.func
+def square_limit(solid: Solid, slot: wp.int32):
+    """Return the square of the distance of boxes that may hold a face as near as the nearest of a slot."""
+    limit = (least_of_slot(slot) + solid.margin) * solid.grow
+    return limit * limit
+
+
+@wp.func
+def open_nodes_of_points(trees: Trees, given: wp.int32, search: wp.ref[PointsSearch], entry: Entry):
+    """Emit those children of a node that may hold a face as near."""
+    emitted = Emitted()
+    slot = item_second(entry.item)
+    limit = square_limit(search.solid, slot)
+    if entry.live and wp.float64(entry.bound) <= limit:
+        squares, codes = wp.vec2d(), wp.vec2i()
+        x = into_frame(search.pose, search.solid, point_of_slot(slot))
+        open_node(trees.states.node_box, search.solid.node, item_first(entry.item), x, squares, codes)
+        emitted.tests = 2
+        for k in range(2):
+            # Infinite where nothing is active.
+            if squares[k] <= limit and squares[k] < wp.float64(wp.inf):
+                emitted.kinds[k] = wp.where(codes[k] < 0, FACES, NODES)
+                emitted.items[k] = pack_item(wp.where(codes[k] < 0, ~codes[k], codes[k]), slot)
+                emitted.bounds[k] = round_down(squares[k])
+    return emitted
+
+
+@wp.func
+def measure_faces_of_points(
+    trees: Trees, given: wp.int32, search: wp.ref[PointsSearch], lists: wp.ref[SearchLists], entry: Entry
+):
+    """Measure a face a lane."""
+    face, slot = item_first(entry.item), item_second(entry.item)
+    live = entry.live and wp.float64(entry.bound) <= square_limit(search.solid, slot)
+    distance = wp.float64(0.0)
+    if live:
+        distance = point_distance(trees, search.pose, search.solid, face, point_of_slot(slot))
+    offer_point_face(live, slot, distance, face, NO_NEAREST)
+
+
+search_points = best_first(
+    BestFirstPolicy(
+        NEAREST_MEMORY,
+        wp.int32,
+        PointsSearch,
+        None,
+        open_nodes_of_points,
+        measure_faces_of_points,
+        measure_faces_of_points,
+        shift=1,
+    )
+)
+
+
+@wp.func
+def nearest_faces_of_warp(trees: Trees, pose: PairPose, solid: Solid, asks: bool, point: wp.vec3d, most: wp.float64):
+    """Return what `nearest_face_within` does of the point of each lane that asks. For all lanes."""
+    search = PointsSearch()
+    search.pose = pose
+    search.solid = solid
+    put_point(warp_lane(), point, most, NO_NEAREST)
+    lists = start_lists(nearest_stack(), STACK_LENGTH)
+    root = load_node(trees.states, solid.node + 1)
+    square = square_outside(root, into_frame(pose, solid, point))
+    starts = asks and square <= square_limit(solid, warp_lane()) and square < wp.float64(wp.inf)
+    # A single face waits at once.
+    place = STACK_LENGTH + next_place(lists.waiting, starts and root.face >= 0)
+    if root.face < 0:
+        place = next_place(lists.end, starts)
+    if starts:
+        item = pack_item(wp.where(root.face >= 0, root.face, root.skip), warp_lane())
+        write_bounded(lists.items, place, item, round_down(square), 0)
+    warp_sync()
+    search_points(trees, 0, search, lists)
+    return least_of_slot(warp_lane()), face_of_slot(warp_lane())
