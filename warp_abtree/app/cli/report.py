@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from warp_abtree.checks.atomic_write import is_special
 
 LISTED = 20  # rows of a table that are printed
+WIDEST = 10_000  # characters of a line that is not for a terminal
 MEASURED = ("milliseconds", "seconds")  # of which three digits are more than is sure
 
 
@@ -42,7 +44,7 @@ def print_result(result: dict, as_json: bool, digits=6):
         if rows and (isinstance(value, np.ndarray) or isinstance(value[0], dict)):
             print(f"\n{heading}:")
             table = [list(row.values()) if isinstance(row, dict) else row for row in value[:LISTED]]
-            print_table([*([list(value[0])] if isinstance(value, list) else []), *table], digits)
+            _print_table([*([list(value[0])] if isinstance(value, list) else []), *table], digits)
             print(f"and {rows - LISTED:,} more; --json lists all\n" if rows > LISTED else "")
         elif value is not None and not (isinstance(value, list) and not value):
             print(f"{heading:<24}{_shown(value, 3 if key in MEASURED else digits)}")
@@ -72,12 +74,20 @@ def show_number(value, digits=6) -> str:
     return f"{value:.{max(digits, whole + digits - 4)}g}"
 
 
-def print_table(rows, digits=6):
-    """Print rows of values, aligned to the left."""
+def _print_table(rows, digits):
+    """Print rows of values as a table of rich, or where that is not installed with tabs between them."""
     rows = [[_shown(value, digits) for value in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(*rows)]
+    try:
+        from rich.console import Console
+        from rich.table import Table
+    except ImportError:
+        print("\n".join("\t".join(row) for row in rows))
+        return
+    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
     for row in rows:
-        print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths)).rstrip())
+        table.add_row(*row)
+    # A file or a pipe takes lines of any length; on a terminal what does not fit goes on in its column.
+    Console(width=None if sys.stdout.isatty() else WIDEST, markup=False, highlight=False).print(table)
 
 
 def check_output(path, suffixes, inputs=(), make=False):
