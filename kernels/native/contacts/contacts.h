@@ -15,29 +15,10 @@ struct ContactFinder {
     const Contacts& contacts;
     const wp::mat33d& rotation;
     const wp::vec3d& position;
-    const wp::vec3i* faces;
-    const double* vertices;
-    const wp::vec4i* corners;
+    const ContactFaces<PairPose> faces;
     bool proven, with_gap, back;
     wp::vec3d* target[5];
 
-    // Corners of so many face pairs, in A's frame.
-    void load(const int* hit, int count, Point (&a)[3], Point (&b)[3]) const {
-        int start[6][8];
-        for (int k = 0; k < 8; ++k) {
-            const wp::vec3i& pair = faces[hit[k < count ? k : 0]];
-            const wp::vec4i& a = corners[pose.corner_a + pair[back ? 2 : 1]];
-            const wp::vec4i& b = corners[pose.corner_b + pair[back ? 1 : 2]];
-            for (int i = 0; i < 3; ++i) {
-                start[i][k] = 4 * a[i];
-                start[3 + i][k] = 4 * b[i];
-            }
-        }
-        for (int i = 0; i < 3; ++i) {
-            a[i] = F::gather(vertices, start[i]);
-            b[i] = C::pose(pose.rotation.data, pose.translation, F::gather(vertices, start[3 + i]));
-        }
-    }
     void store(const int* hit, int count, const Point (&found)[5]) const {
         if (count == 8 && hit[7] - hit[0] == 7) {
             for (int i = 0; i < 5; ++i)
@@ -57,7 +38,7 @@ struct ContactFinder {
     // Those of faces that are apart; what it is not sure of keeps its mark.
     void find_near(const int* hit, int count) const {
         Point a[3], b[3], of_b[3];
-        load(hit, count, a, b);
+        faces.load(hit, count, a, b);
         for (int i = 0; i < 3; ++i)
             of_b[i] = F::minus(b[i], a[0]);
         const Depth64::Scaled t = Depth64::scale(a, of_b);
@@ -81,7 +62,7 @@ struct ContactFinder {
     // So many face pairs; returns those that it is not sure of, a bit each.
     unsigned int find(bool extends, const int* hit, int count) const {
         Point a[3], b[3], d[3][3];
-        load(hit, count, a, b);
+        faces.load(hit, count, a, b);
         // From each corner of A to each of B: the other way round, every rounding is the same.
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j)
@@ -126,9 +107,7 @@ wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const 
         contacts,
         rotation,
         position,
-        faces.data,
-        (const double*)models.vertex_pos.data,
-        states.face_corner.data,
+        {pose, faces.data, (const double*)models.vertex_pos.data, states.face_corner.data},
         proven,
         with_gap,
         pose.swapped != 0,

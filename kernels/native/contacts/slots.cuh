@@ -89,24 +89,3 @@ inline CUDA_CALLABLE void put_into_slots(wp::int64* slots, const float* scores, 
     }
 #endif
 }
-
-typedef SlotScores<float, bool, int> PointScores;
-
-inline CUDA_CALLABLE wp::int32 find_bin(wp::vec3 normal, wp::array_t<wp::float32> directions) {
-    return PointScores::find_bin({normal[0], normal[1], normal[2]}, directions.data);
-}
-
-inline CUDA_CALLABLE wp::vec_t<SCORES, wp::float32> no_scores() { return wp::vec_t<SCORES, wp::float32>(NO_SCORE); }
-
-inline CUDA_CALLABLE void rate_point(wp::vec3 point, wp::float32 separation, wp::float32 weight, wp::int32 bin,
-                                     wp::array_t<wp::float32> directions, wp::vec_t<SCORES, wp::float32>& scores) {
-    PointScores own(bin, directions.data);
-    own.offer(weight, {point[0], point[1], point[2]}, separation, true);
-    for (int k = 0; k < SCORES; ++k)
-        scores[k] = own.score[k] > scores[k] ? own.score[k] : scores[k];
-}
-
-inline CUDA_CALLABLE void offer_scores(wp::vec_t<SCORES, wp::float32> scores, wp::int32 bin, wp::int32 place,
-                                       wp::int32 pair, wp::array_t<wp::int64> slots) {
-    put_into_slots(slots.data + (wp::int64)pair * SLOT_ROOM + SLOTS_A_BIN * (bin / 9), &scores[0], SCORES, 32, place);
-}

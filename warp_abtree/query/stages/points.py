@@ -169,8 +169,12 @@ class PointStage(Stage):
         self._sort_keys(count, 31)
         inputs = [*posed[:2], start, faces, contacts, of.order, curves]
         launch(loops.average_loop_kernel, -(-count // WARP_SIZE) * WARP_SIZE, inputs, WARP_SIZE)
-        inputs = [*posed, start, faces, of.order, contacts, curves, self._slots.slots]
-        launch(manifold.offer_crossing_kernel, count, inputs)
+        if operator.uses_warps():
+            inputs = [*posed, start, faces, of.order, contacts, curves, self._slots.slots]
+            launch(manifold.offer_crossing_kernel, count, inputs)
+        else:
+            inputs = [*posed, start, faces, contacts, curves, self._slots.slots]
+            launch(manifold.offer_pair_crossing_kernel, operator.rooms.pairs, inputs)
 
     def _choose_points(self, given):
         """Choose the points of each pair. Launches only."""

@@ -1,0 +1,240 @@
+// Columns of faces along a direction: what lies of another face within one, its corners and their depths; of one pair
+// in a thread, of 8 on the CPU.
+#pragma once
+#include "builtin.h"
+#include "base/points64.cuh"
+#include "base/sizes.h"
+
+// A face seen at a smaller cosine along a direction says nothing about depth in that direction.
+constexpr double FACING = 0.1;
+// By which part of a face's size its column is wider, so that walls that stand on its rim are inside.
+constexpr double COLUMN_SLACK = 0x1p-36;
+// Part of the size of faces that depths in a column err by.
+constexpr double COLUMN_ROUNDING = 0x1p-46;
+// A face's own normal serves in place of the loop's within 60 degrees of it.
+constexpr double LIKENESS = 0.5;
+// Part of the distance that the gap along a face's normal differs by, where that is the direction of the distance.
+constexpr double ALIKE = 0x1p-10;
+
+template <class Number>
+struct Columns : Points64<Number> {
+    typedef Points64<Number> F;
+    typedef typename F::lanes lanes;
+    typedef typename F::bits bits;
+    typedef typename F::Point Point;
+    using F::choose;
+    using F::dot;
+    using F::greater;
+    using F::lesser;
+    using F::minus;
+    using F::negate;
+
+    // The faces of the pair's first object and of its second, A's frame.
+    struct Faces {
+        Point a[3], b[3];
+    };
+    // Depth of a column that holds no corner.
+    static CUDA_CALLABLE lanes no_depth() { return lanes{} - INFINITY; }
+    // One of three points; on a GPU they are in registers, which have no address.
+    static CUDA_CALLABLE Point get(const Point (&p)[3], int k) {
+#if defined(__CUDA_ARCH__)
+        return choose(k == 0, p[0], choose(k == 1, p[1], p[2]));
+#else
+        return p[k];
+#endif
+    }
+    static CUDA_CALLABLE Point go(const Point& p, const Point& way, const lanes& t) {
+        return Point{p.x + way.x * t, p.y + way.y * t, p.z + way.z * t};
+    }
+    // What depths in a column err by at most: a part of the size of both faces.
+    static CUDA_CALLABLE lanes find_slack(const Faces& f) {
+        lanes size = greater(F::largest(minus(f.a[1], f.a[0])), F::largest(minus(f.a[2], f.a[0])));
+        size = greater(size, greater(F::largest(minus(f.b[0], f.a[0])), F::largest(minus(f.b[1], f.a[0]))));
+        return COLUMN_ROUNDING * greater(size, F::largest(minus(f.b[2], f.a[0])));
+    }
+
+    // The column of one face along a normal, and the face that it cuts. The corners of what lies of that within it are
+    // the ends of its edges, clipped, and where the column's edges pierce it: nine at most, each of them once.
+    struct Column {
+        Point normal;    // unit, from the pair's first object to its second
+        bits looks;      // whether the face looks along it: else it cuts nothing
+        Point plane;     // the face's normal over its cosine with the column's
+        Point u[3];      // corners of the face
+        Point v[3];      // corners of the other one
+        Point side[3];   // normals of the column's sides, inwards, of any length
+        lanes slack[3];  // by which each side is wider, times that length
+
+        // Of the face that looks more along n.
+        CUDA_CALLABLE Column(const Faces& f, const Point& n, const Point& normal_a, const Point& normal_b) {
+            const lanes facing_a = dot(n, normal_a), facing_b = -dot(n, normal_b);
+            const bits other = facing_b > facing_a;
+            const lanes facing = greater(facing_a, facing_b);
+            normal = n;
+            looks = negate(facing < FACING);
+            plane = choose(other, normal_b, normal_a);
+            plane = Point{plane.x / facing, plane.y / facing, plane.z / facing};
+            for (int k = 0; k < 3; ++k) {
+                u[k] = choose(other, f.b[k], f.a[k]);
+                v[k] = choose(other, f.a[k], f.b[k]);
+            }
+            for (int k = 0; k < 3; ++k) {
+                const Point edge = minus(u[(k + 1) % 3], u[k]), across = minus(u[(k + 2) % 3], u[k]);
+                const Point out = F::cross(edge, n);
+                side[k] = choose(dot(out, across) < 0.0, negate(out), out);
+                slack[k] = COLUMN_SLACK * (F::sum_sizes(edge) + F::sum_sizes(across)) * F::sum_sizes(side[k]);
+            }
+        }
+        CUDA_CALLABLE lanes depth_of(const Point& point) const { return dot(minus(u[0], point), plane); }
+        // Between which parameters an edge lies within the column, the first more where it does not.
+        struct Range {
+            lanes low, high;
+            CUDA_CALLABLE bits exists() const { return low <= high; }
+            // Whether the edge leaves the column before its end, which is where the next one starts.
+            CUDA_CALLABLE bits leaves() const { return (high < 1.0) & (low < high); }
+        };
+        // Clips edge i of the other face, from p to q.
+        CUDA_CALLABLE Range clip(int i, Point& p, Point& q) const {
+            p = get(v, i);
+            q = get(v, i == 2 ? 0 : i + 1);
+            Range range = {lanes{}, lanes{} + 1.0};
+            for (int k = 0; k < 3; ++k) {
+                const lanes at_p = dot(side[k], minus(p, u[k])) + slack[k];
+                const lanes at_q = dot(side[k], minus(q, u[k])) + slack[k];
+                const bits p_out = at_p < 0.0, q_out = at_q < 0.0, out = p_out & q_out;
+                lanes t = {};
+                if (Number::any(p_out ^ q_out))
+                    t = at_p / (at_p - at_q);
+                range.low = out ? lanes{} + 2.0 : (p_out ? greater(range.low, t) : range.low);
+                range.high = out ? lanes{} + 1.0 : (q_out ? lesser(range.high, t) : range.high);
+            }
+            return range;
+        }
+        // Where the edge of the column at corner i of its face pierces the other face; returns whether it does.
+        CUDA_CALLABLE bits pierce(int i, Point& point) const {
+            const Point m = F::cross(minus(v[1], v[0]), minus(v[2], v[0]));
+            const lanes along = dot(normal, m);
+            point = get(u, i);
+            point = go(point, normal, dot(minus(v[0], point), m) / along);
+            bits inside = along != 0.0;
+#pragma unroll
+            for (int k = 0; k < 3; ++k) {
+                if (!Number::any(inside))
+                    return inside;
+                const Point edge = minus(v[(k + 1) % 3], v[k]);
+                inside &= dot(F::cross(edge, minus(point, v[k])), m) > 0.0;
+            }
+            return inside;
+        }
+        // How deep the deepest corner is that is deep enough: from `least` on, 0 or minus the gap.
+        CUDA_CALLABLE lanes find_depth(const lanes& least) const {
+            lanes depth = no_depth();
+            auto raise = [&](const bits& exists, const lanes& x) {
+                depth = exists & (x >= least) ? greater(depth, x) : depth;
+            };
+            if (!Number::any(looks))
+                return depth;
+#pragma unroll 1
+            for (int i = 0; i < 3; ++i) {
+                Point p, q;
+                const Range range = clip(i, p, q);
+                // Depth is linear along the edge.
+                const lanes at_p = depth_of(p), at_q = depth_of(q);
+                raise(range.exists(), at_p + (at_q - at_p) * range.low);
+                raise(range.exists() & range.leaves(), at_p + (at_q - at_p) * range.high);
+                const bits pierces = pierce(i, p);
+                raise(pierces, depth_of(p));
+            }
+            return looks ? depth : no_depth();
+        }
+        // Offers the corners of what the column cuts, and their depths, to a keeper.
+        template <class Keeper>
+        CUDA_CALLABLE void visit(Keeper& keeper) const {
+#pragma unroll 1
+            for (int k = 0; k < 9; ++k) {
+                Point p, q;
+                bits exists;
+                if (k < 6) {
+                    const Range range = clip(k / 2, p, q);
+                    const lanes t = k % 2 == 0 ? range.low : range.high;
+                    exists = range.exists();
+                    if (k % 2 != 0)
+                        exists = exists & range.leaves();
+                    p = choose(t > 0.0, go(p, minus(q, p), t), p);
+                } else
+                    exists = pierce(k - 6, p);
+                keeper.offer(p, depth_of(p), exists);
+            }
+        }
+    };
+    // The normal of a column, and how deep one face is in that of the other.
+    struct Measured {
+        Point normal;
+        lanes depth;
+    };
+    static CUDA_CALLABLE Measured measure(const Faces& f, const Point& n, const Point& normal_a, const Point& normal_b,
+                                          const lanes& least) {
+        return Measured{n, Column(f, n, normal_a, normal_b).find_depth(least)};
+    }
+
+    // A contact of faces that cross, in A's frame.
+    struct Crossing {
+        Faces faces;
+        Point normal_a, normal_b, loop;  // unit normals of the faces, and of the contact's loop
+        bits has_area;                   // whether that is the normal of an area
+        lanes least;  // depth from which on there are candidates: 0, or minus the gap where faces look at one another
+
+        // Of normals in the world, turned into A's frame, and of a gap, 0 for none.
+        CUDA_CALLABLE Crossing(const Faces& faces, const double (&rotation)[3][3], const Point& world_a,
+                               const Point& world_b, const Point& world_loop, const bits& has_area, double gap)
+            : faces(faces),
+              normal_a(F::turn_back(rotation, world_a)),
+              normal_b(F::turn_back(rotation, world_b)),
+              loop(F::turn_back(rotation, world_loop)),
+              has_area(has_area) {
+            least = -dot(world_a, world_b) >= LIKENESS ? lanes{} - gap : lanes{};
+        }
+        // Whether a face lies in front of the plane through u whose normal is n.
+        static CUDA_CALLABLE bits lies_in_front(const Point& n, const Point& u, const Point (&v)[3],
+                                                const lanes& slack) {
+            const lanes x = dot(n, minus(v[0], u)), y = dot(n, minus(v[1], u)), z = dot(n, minus(v[2], u));
+            return (lesser(x, lesser(y, z)) >= -slack) & (dot(n, n) > 0.0);
+        }
+        // Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap
+        // least; of both faces' normals where neither is like it and one looks the other way. Where faces merely touch,
+        // the normal of a face that has the other in front serves, if it is like the loop's or that has no area, as
+        // rounding may have made it; edges beside one another have none then.
+        CUDA_CALLABLE Measured measure() const {
+            const lanes slack = find_slack(faces), toward_a = dot(loop, normal_a), toward_b = -dot(loop, normal_b);
+            const bits any_loop = negate(has_area);
+            const bits touches_a =
+                lies_in_front(normal_a, faces.a[0], faces.b, slack) & (any_loop | (toward_a > LIKENESS));
+            const bits touches_b =
+                lies_in_front(normal_b, faces.b[0], faces.a, slack) & (any_loop | (toward_b > LIKENESS));
+            const bits touches = touches_a | touches_b;
+            const bits none = touches_a & touches_b & (-dot(normal_a, normal_b) < LIKENESS);
+            // A loop that runs all round a part in another, as round a thread, has no one way out.
+            const lanes toward = greater(toward_a, toward_b);
+            const bits contrary = (toward >= FACING) & (toward <= LIKENESS) & (lesser(toward_a, toward_b) < -FACING);
+            // Of columns only normals and depths are kept: a second one beside the first does not fit into registers.
+            Measured best = {loop, no_depth()};
+#pragma unroll 1
+            for (int k = 0; k < 3; ++k) {
+                Point n = k == 1 ? normal_a : negate(normal_b);
+                bits tried = negate(touches) & (contrary | (dot(n, loop) > LIKENESS)), tight = negate(bits{});
+                if (k == 0) {
+                    n = choose(touches, choose(touches_a, normal_a, n), loop);
+                    tried = negate(none);
+                    tight = touches;
+                }
+                if (!Number::any(tried))
+                    continue;
+                const lanes depth =
+                    Columns::measure(faces, n, normal_a, normal_b, tight ? lesser(least, -slack) : least).depth;
+                const bits closer = (best.depth < -slack) | (depth <= best.depth + slack);
+                const bits better = k == 0 ? tried : tried & (depth >= -slack) & closer;
+                best = Measured{choose(better, n, best.normal), better ? depth : best.depth};
+            }
+            return best;
+        }
+    };
+};
