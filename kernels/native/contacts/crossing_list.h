@@ -33,11 +33,8 @@ void simd_offer_crossing(const Trees& trees, const PairPose& pose, wp::int32 a, 
         const C::Crossing contact(f, trees.objects.rotation.data[a].data, load(contacts.normal_a.data + first, count),
                                   load(contacts.normal_b.data + first, count), load(loop, count), has_area, gap);
         const CrossingRate<Lanes64> rated(view, contact, contact.measure());
-        for (int k = 0; k < count; ++k) {
-            float scores[SCORES];
-            for (int i = 0; i < SCORES; ++i)
-                scores[i] = rated.scores.score[i][k];
-            put_into_slots(own + SLOTS_A_BIN * (rated.scores.bin[k] / 9), scores, SCORES, 32, first + k);
-        }
+        const SlotKeys<Lanes64::floats, Lanes64::float_bits, Lanes64::integers> keys(rated.scores, 32);
+        for (int k = 0; k < count; ++k)
+            keys.put(own + SLOTS_A_BIN * (rated.scores.bin[k] / 9), k, SCORES, first + k);
     }
 }
