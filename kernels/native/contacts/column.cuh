@@ -92,14 +92,25 @@ struct Columns : Points64<Number> {
             // Whether the edge leaves the column before its end, which is where the next one starts.
             CUDA_CALLABLE bits leaves() const { return (high < 1.0) & (low < high); }
         };
-        // Clips edge i of the other face, from p to q.
-        CUDA_CALLABLE Range clip(int i, Point& p, Point& q) const {
+        // Heights of a point over the column's sides.
+        struct Heights {
+            lanes side[3];
+        };
+        CUDA_CALLABLE Heights over_sides(const Point& point) const {
+            Heights x;
+            for (int k = 0; k < 3; ++k)
+                x.side[k] = dot(side[k], minus(point, u[k])) + slack[k];
+            return x;
+        }
+        // Clips edge i of the other face, from p to q; takes the heights of p, and leaves those of q.
+        CUDA_CALLABLE Range clip(int i, Heights& heights, Point& p, Point& q) const {
             p = get(v, i);
             q = get(v, i == 2 ? 0 : i + 1);
+            const Heights before = heights;
+            heights = over_sides(q);
             Range range = {lanes{}, lanes{} + 1.0};
             for (int k = 0; k < 3; ++k) {
-                const lanes at_p = dot(side[k], minus(p, u[k])) + slack[k];
-                const lanes at_q = dot(side[k], minus(q, u[k])) + slack[k];
+                const lanes at_p = before.side[k], at_q = heights.side[k];
                 const bits p_out = at_p < 0.0, q_out = at_q < 0.0, out = p_out & q_out;
                 lanes t = {};
                 if (Number::any(p_out ^ q_out))
@@ -133,10 +144,11 @@ struct Columns : Points64<Number> {
             };
             if (!Number::any(looks))
                 return depth;
+            Heights heights = over_sides(v[0]);
 #pragma unroll 1
             for (int i = 0; i < 3; ++i) {
                 Point p, q;
-                const Range range = clip(i, p, q);
+                const Range range = clip(i, heights, p, q);
                 // Depth is linear along the edge.
                 const lanes at_p = depth_of(p), at_q = depth_of(q);
                 raise(range.exists(), at_p + (at_q - at_p) * range.low);
@@ -149,20 +161,24 @@ struct Columns : Points64<Number> {
         // Offers the corners of what the column cuts, and their depths, to a keeper.
         template <class Keeper>
         CUDA_CALLABLE void visit(Keeper& keeper) const {
+            Heights heights = over_sides(v[0]);
 #pragma unroll 1
-            for (int k = 0; k < 9; ++k) {
+            for (int i = 0; i < 3; ++i) {
                 Point p, q;
-                bits exists;
-                if (k < 6) {
-                    const Range range = clip(k / 2, p, q);
-                    const lanes t = k % 2 == 0 ? range.low : range.high;
-                    exists = range.exists();
-                    if (k % 2 != 0)
-                        exists = exists & range.leaves();
-                    p = choose(t > 0.0, go(p, minus(q, p), t), p);
-                } else
-                    exists = pierce(k - 6, p);
-                keeper.offer(p, depth_of(p), exists);
+                const Range range = clip(i, heights, p, q);
+                const Point way = minus(q, p);
+#pragma unroll 1
+                for (int k = 0; k < 2; ++k) {
+                    const lanes t = k == 0 ? range.low : range.high;
+                    const Point end = choose(t > 0.0, go(p, way, t), p);
+                    keeper.offer(end, depth_of(end), k == 0 ? range.exists() : range.exists() & range.leaves());
+                }
+            }
+#pragma unroll 1
+            for (int i = 0; i < 3; ++i) {
+                Point p;
+                const bits pierces = pierce(i, p);
+                keeper.offer(p, depth_of(p), pierces);
             }
         }
     };
