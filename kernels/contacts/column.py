@@ -1,4 +1,4 @@
-"""The faces of a contact, and columns of faces along a direction (`native/contacts/column.cuh`)."""
+"""The faces of a contact, and columns of faces along a direction (`native/triangle/column.cuh`)."""
 
 import warp as wp
 

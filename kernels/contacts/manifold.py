@@ -10,7 +10,7 @@ from warp_abtree.kernels.contacts.contact import Contacts
 from warp_abtree.kernels.contacts.slots import Slots, WitnessRows
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 
-wp.set_module_options(native.options("contacts/crossing.cuh", "contacts/crossing_list.h"))
+wp.set_module_options(native.options("contacts/candidates.cuh", "contacts/crossing_list.h"))
 
 POINTS = wp.constant(8)
 """Points that stand for a pair, unless told otherwise."""

@@ -4,6 +4,7 @@
 #include "builtin.h"
 #include "base/sizes.h"
 #include "base/float64.h"
+#include "intersect/filter_lists.h"
 
 // What the filter reads of an object pair, and its steps.
 template <class PairPose>
@@ -18,21 +19,6 @@ struct Float64Filter {
     typedef int four_ints __attribute__((vector_size(16)));
     typedef unsigned int counts __attribute__((vector_size(32)));
     typedef int ids[STRADDLING_ROOM];
-    // Lists of those that meet, that are still open and, unless null, that are apart, and how long they are.
-    struct Lists {
-        wp::int64 *hits, *rest, *beside;
-        int met, open, apart;
-        void keep_apart(const bits& item, unsigned int which) {
-            if (beside == nullptr)
-                return;
-            F::append(beside + apart, item, which);
-            apart += __builtin_popcount(which);
-        }
-        void keep_hits(const bits& item, unsigned int which) {
-            F::append(hits + met, item, which);
-            met += __builtin_popcount(which);
-        }
-    };
     const PairPose& pose;
     const double *position, *corners;
 
@@ -76,7 +62,7 @@ struct Float64Filter {
     }
     // Up to 8 straddling pairs from one on, which two more signs decide.
     __attribute__((always_inline)) void order_ends(const ids (&rotated)[6], const wp::int64* straddling, int first,
-                                                   int count, Lists& lists) const {
+                                                   int count, FilterLists& lists) const {
         const Point p1 = F::gather(position, rotated[0] + first), q1 = F::gather(position, rotated[1] + first);
         const Point r1 = F::gather(position, rotated[2] + first), p2 = gather_posed(rotated[3] + first);
         const Point q2 = gather_posed(rotated[4] + first), r2 = gather_posed(rotated[5] + first);
@@ -142,8 +128,7 @@ void simd_float64_filter(const ModelPool& models, const StatePool& states, const
     const double* position = (const double*)models.vertex_pos.data;
     const Filter filter = {pose, position, (const double*)states.face_corner.data};
     const wp::int64* items = uncertain.data;
-    typename Filter::Lists lists = {faces.data, uncertain.data, lists_apart ? apart.data : nullptr, found.met,
-                                    0,          found.apart};
+    FilterLists lists = {faces.data, uncertain.data, lists_apart ? apart.data : nullptr, found.met, 0, found.apart};
     int kept = 0;
     // Straddling pairs, which two more signs decide, and their corners, rotated: p, q, r of A and of B.
     typename Filter::ids rotated[6], start[6];
@@ -188,8 +173,7 @@ void simd_float64_filter(const ModelPool& models, const StatePool& states, const
             const unsigned int undecided = Filter::find_undecided(left, bound, d_size, side_a, side_b, shared);
             left &= ~undecided;
             lists.keep_hits(item, shared);
-            F::append(lists.rest + lists.open, item, undecided & ~shared);
-            lists.open += __builtin_popcount(undecided & ~shared);
+            lists.keep_open(item, undecided & ~shared);
             alone_a = F::find_alone(side_a);
             alone_b = F::find_alone(side_b);
         }

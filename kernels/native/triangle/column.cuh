@@ -11,10 +11,6 @@ constexpr double FACING = 0.1;
 constexpr double COLUMN_SLACK = 0x1p-36;
 // Part of the size of faces that depths in a column err by.
 constexpr double COLUMN_ROUNDING = 0x1p-46;
-// A face's own normal serves in place of the loop's within 60 degrees of it.
-constexpr double LIKENESS = 0.5;
-// Part of the distance that the gap along a face's normal differs by, where that is the direction of the distance.
-constexpr double ALIKE = 0x1p-10;
 
 template <class Number>
 struct Columns : Points64<Number> {
@@ -191,66 +187,4 @@ struct Columns : Points64<Number> {
                                           const lanes& least) {
         return Measured{n, Column(f, n, normal_a, normal_b).find_depth(least)};
     }
-
-    // A contact of faces that cross, in A's frame.
-    struct Crossing {
-        Faces faces;
-        Point normal_a, normal_b, loop;  // unit normals of the faces, and of the contact's loop
-        bits has_area;                   // whether that is the normal of an area
-        lanes least;  // depth from which on there are candidates: 0, or minus the gap where faces look at one another
-
-        // Of normals in the world, turned into A's frame, and of a gap, 0 for none.
-        CUDA_CALLABLE Crossing(const Faces& faces, const double (&rotation)[3][3], const Point& world_a,
-                               const Point& world_b, const Point& world_loop, const bits& has_area, double gap)
-            : faces(faces),
-              normal_a(F::turn_back(rotation, world_a)),
-              normal_b(F::turn_back(rotation, world_b)),
-              loop(F::turn_back(rotation, world_loop)),
-              has_area(has_area) {
-            least = -dot(world_a, world_b) >= LIKENESS ? lanes{} - gap : lanes{};
-        }
-        // Whether a face lies in front of the plane through u whose normal is n.
-        static CUDA_CALLABLE bits lies_in_front(const Point& n, const Point& u, const Point (&v)[3],
-                                                const lanes& slack) {
-            const lanes x = dot(n, minus(v[0], u)), y = dot(n, minus(v[1], u)), z = dot(n, minus(v[2], u));
-            return (lesser(x, lesser(y, z)) >= -slack) & (dot(n, n) > 0.0);
-        }
-        // Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap
-        // least; of both faces' normals where neither is like it and one looks the other way. Where faces merely touch,
-        // the normal of a face that has the other in front serves, if it is like the loop's or that has no area, as
-        // rounding may have made it; edges beside one another have none then.
-        CUDA_CALLABLE Measured measure() const {
-            const lanes slack = find_slack(faces), toward_a = dot(loop, normal_a), toward_b = -dot(loop, normal_b);
-            const bits any_loop = negate(has_area);
-            const bits touches_a =
-                lies_in_front(normal_a, faces.a[0], faces.b, slack) & (any_loop | (toward_a > LIKENESS));
-            const bits touches_b =
-                lies_in_front(normal_b, faces.b[0], faces.a, slack) & (any_loop | (toward_b > LIKENESS));
-            const bits touches = touches_a | touches_b;
-            const bits none = touches_a & touches_b & (-dot(normal_a, normal_b) < LIKENESS);
-            // A loop that runs all round a part in another, as round a thread, has no one way out.
-            const lanes toward = greater(toward_a, toward_b);
-            const bits contrary = (toward >= FACING) & (toward <= LIKENESS) & (lesser(toward_a, toward_b) < -FACING);
-            // Of columns only normals and depths are kept: a second one beside the first does not fit into registers.
-            Measured best = {loop, no_depth()};
-#pragma unroll 1
-            for (int k = 0; k < 3; ++k) {
-                Point n = k == 1 ? normal_a : negate(normal_b);
-                bits tried = negate(touches) & (contrary | (dot(n, loop) > LIKENESS)), tight = negate(bits{});
-                if (k == 0) {
-                    n = choose(touches, choose(touches_a, normal_a, n), loop);
-                    tried = negate(none);
-                    tight = touches;
-                }
-                if (!Number::any(tried))
-                    continue;
-                const lanes depth =
-                    Columns::measure(faces, n, normal_a, normal_b, tight ? lesser(least, -slack) : least).depth;
-                const bits closer = (best.depth < -slack) | (depth <= best.depth + slack);
-                const bits better = k == 0 ? tried : tried & (depth >= -slack) & closer;
-                best = Measured{choose(better, n, best.normal), better ? depth : best.depth};
-            }
-            return best;
-        }
-    };
 };
