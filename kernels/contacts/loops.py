@@ -14,7 +14,7 @@ from warp_abtree.kernels.contacts.contact import Contacts, pair_direction
 from warp_abtree.kernels.contacts.manifold import Curves
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
-wp.set_module_options(native.options("base/lanes.cuh"))
+wp.set_module_options(native.options("base/lanes.cuh", "io/sort_by_pair.h"))
 
 # Areas of a loop, relative to its length squared, that have no direction worth the name.
 LEAST_LOOP_AREA = wp.constant(wp.float64(2.0**-20))
@@ -87,6 +87,25 @@ def begin_loop_kernel(
     if i < start[start.shape[0] - 1]:
         curves_out.parent[i] = i
         key_out[i] = contact_key(faces[i][0], faces[i][2])
+
+
+@native.func_native(cpu=True)
+def sort_span(first: wp.int32, last: wp.int32, key: wp.array(dtype=wp.int64), order: wp.array(dtype=wp.int32)):
+    """Sort a span of keys that differ in their low 31 bits alone, equal ones as they are, and numbers with them."""
+
+
+@wp.kernel
+def sort_loop_kernel(
+    start: wp.array(dtype=wp.int32), key_inout: wp.array(dtype=wp.int64), order_inout: wp.array(dtype=wp.int32)
+):
+    """Sort the contacts of one object pair by their keys, one thread after the other, CPU only.
+
+    Args:
+        key_inout: Keys, then scratch, shape [2 capacity].
+    """
+    p = wp.tid()
+    if start[p] < start[p + 1]:
+        sort_span(start[p], start[p + 1], key_inout, order_inout)
 
 
 @wp.kernel

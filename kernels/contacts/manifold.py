@@ -3,34 +3,20 @@
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import Trees
-from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
-from warp_abtree.kernels.contacts.column import (
-    COLUMN_CORNERS,
-    FACING,
-    NO_DEPTH,
-    POSSIBLE_CORNERS,
-    Column,
-    column_corner,
-    column_slack,
-    load_pair,
-    make_column,
-    measure_column,
-)
+from warp_abtree.kernels.base.arrays import ObjectPool, Trees
+from warp_abtree.kernels.base.poses import PairBatch, PairPose
+from warp_abtree.kernels.contacts.column import COLUMN_CORNERS, NO_DEPTH, FacePair, load_pair
 from warp_abtree.kernels.contacts.contact import Contacts
-from warp_abtree.kernels.contacts.slots import Slots, WitnessRows, find_bin, no_scores, offer_scores, rate_point
+from warp_abtree.kernels.contacts.slots import Slots, WitnessRows
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 
-wp.set_module_options(native.options("contacts/slots.cuh"))
+wp.set_module_options(native.options("contacts/candidates.cuh", "contacts/crossing_list.h"))
 
 POINTS = wp.constant(8)
 """Points that stand for a pair, unless told otherwise."""
 
-# A face's own normal serves in place of the loop's within 60 degrees of it.
-LIKENESS = wp.constant(wp.float64(0.5))
 # Depth of candidates that there are not; where all of a pair have NO_DEPTH the middles of its contacts serve.
 NO_POINT = wp.constant(wp.float64(wp.nan))
-NO_DEPTH_SEPARATION = wp.constant(wp.float32(2.0**60))  # more than any, in offers to slots
 
 
 @wp.struct
@@ -67,120 +53,54 @@ class Manifolds:
     witness: wp.array2d(dtype=wp.int32)  # that each is a candidate of, shape [pair, points], or [0, 0] where not kept
 
 
-@wp.func
-def write_candidates(
-    w: wp.int32,
-    rotation: wp.mat33d,
-    position: wp.vec3d,
-    column: Column,
-    least: wp.float64,
-    witnesses: Witnesses,
+@native.func_native()
+def offer_crossing(
+    trees: Trees,
+    pose: PairPose,
+    pair: FacePair,
+    loop: wp.vec3d,
+    has_area: bool,
+    gap: wp.float64,
+    place: wp.int32,
+    p: wp.int32,
+    slots: Slots,
 ):
-    """Write the candidates of a witness, posed to the world: the corners of a column that are deep enough."""
-    witnesses.normal[w] = rotation * column.normal
-    place, k = wp.int32(0), wp.int32(0)
-    while k < POSSIBLE_CORNERS:
-        point, depth, exists = column_corner(column, k)
-        if exists and depth >= least and place < COLUMN_CORNERS:
-            witnesses.depth[w, place] = depth
-            witnesses.point[w, place] = pose_point(rotation, position, point)
-            place += 1
-        k += 1
-    while place < COLUMN_CORNERS:
-        witnesses.depth[w, place] = NO_POINT
-        place += 1
-
-
-@wp.func
-def write_middle(w: wp.int32, i: wp.int32, n: wp.vec3d, contacts: Contacts, witnesses: Witnesses):
-    """Write the middle and an end of contact i as candidates, which have no depth."""
-    witnesses.normal[w] = n
-    for k in range(COLUMN_CORNERS):
-        witnesses.depth[w, k] = wp.where(k < 2, NO_DEPTH, NO_POINT)
-    witnesses.point[w, 0] = wp.float64(0.5) * (contacts.p0[i] + contacts.p1[i])
-    witnesses.point[w, 1] = contacts.p1[i]
-
-
-@wp.func
-def lies_in_front(n: wp.vec3d, u: wp.vec3d, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, slack: wp.float64):
-    """Return whether a face lies in front of the plane through u whose normal is n."""
-    least = wp.min(wp.dot(n, v0 - u), wp.min(wp.dot(n, v1 - u), wp.dot(n, v2 - u)))
-    return least >= -slack and wp.dot(n, n) > wp.float64(0.0)
-
-
-@wp.struct
-class Crossing:
-    """A contact of faces that cross, to find its candidates."""
-
-    i: wp.int32  # its place among contacts
-    a: wp.int32  # object A of its pair
-    faces: wp.vec3i  # pair, face of its first object, face of its second
-    least: wp.float64  # depth from which on there are candidates: 0, or minus the gap where faces look at one another
-
-
-@wp.func
-def load_crossing(i: wp.int32, batch: PairBatch, gap: wp.array(dtype=wp.float64), faces: wp.vec3i, contacts: Contacts):
-    """Return a contact.
+    """Offer the candidates of a contact of faces that cross to the slots of its object pair p.
 
     Args:
-        gap: Of each pair [world units], or [0] for none.
+        loop, has_area: Normal of its loop, and whether it is that of an area.
+        gap: How far outside points may be, of faces that look at one another [world units], 0 for not at all.
+        place: Of the contact.
     """
-    crossing = Crossing()
-    crossing.i = i
-    crossing.faces = faces
-    crossing.a = wp.min(batch.pairs[faces[0]][0], batch.pairs[faces[0]][1])
-    if gap.shape[0] > 0 and -wp.dot(contacts.normal_a[i], contacts.normal_b[i]) >= LIKENESS:
-        crossing.least = -gap[faces[0]]
-    return crossing
+
+
+@native.func_native()
+def find_crossing(
+    objects: ObjectPool,
+    pair: FacePair,
+    loop: wp.vec3d,
+    has_area: bool,
+    gap: wp.float64,
+    w: wp.int32,
+    witnesses: Witnesses,
+) -> bool:
+    """Write the normal and the candidates of witness w, as for `offer_crossing`; return whether they have a depth."""
 
 
 @wp.func
-def measure_crossing(crossing: Crossing, trees: Trees, pose: PairPose, contacts: Contacts, curves: Curves):
-    """Return the column of a contact of faces that cross, in A's frame.
+def gap_of(gap: wp.array(dtype=wp.float64), p: wp.int32):
+    """Return the gap of a pair, 0 where there is none."""
+    shell = wp.float64(0.0)
+    if gap.shape[0] > 0:
+        shell = gap[p]
+    return shell
 
-    Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least; of
-    both faces' normals where neither is like it and one looks the other way. Where faces merely touch, the normal of a
-    face that has the other in front serves, if it is like the loop's or that has no area, as rounding may have made it;
-    edges beside one another have none then.
-    """
-    pair = load_pair(trees, pose, crossing.faces)
-    back = wp.transpose(trees.objects.rotation[crossing.a])
-    normal_a = back * contacts.normal_a[crossing.i]
-    normal_b = back * contacts.normal_b[crossing.i]
-    least, slack = crossing.least, column_slack(pair)
-    loop = back * curves.loop_normal[curves.loop[crossing.i]]
-    touches_a = lies_in_front(normal_a, pair.a0, pair.b0, pair.b1, pair.b2, slack)
-    touches_b = lies_in_front(normal_b, pair.b0, pair.a0, pair.a1, pair.a2, slack)
-    if curves.has_area[curves.loop[crossing.i]] != 0:
-        touches_a = touches_a and wp.dot(loop, normal_a) > LIKENESS
-        touches_b = touches_b and -wp.dot(loop, normal_b) > LIKENESS
-    if touches_a and touches_b and -wp.dot(normal_a, normal_b) < LIKENESS:
-        none = Column()
-        none.normal = loop
-        none.depth = NO_DEPTH
-        return none
-    # Of columns only normals and depths are kept: a second one beside the first would not fit into registers.
-    best_n, best_depth = wp.vec3d(loop), -wp.float64(wp.inf)
-    toward_a, toward_b = wp.dot(loop, normal_a), -wp.dot(loop, normal_b)
-    toward = wp.max(toward_a, toward_b)
-    # A loop that runs all round a part in another, as round a thread, has no one way out.
-    contrary = FACING <= toward and toward <= LIKENESS and wp.min(toward_a, toward_b) < -FACING
-    touches = touches_a or touches_b
-    k = wp.int32(0)
-    while k < wp.where(touches, 1, 3):
-        n = wp.where(k == 1 or (k == 0 and touches_a), normal_a, -normal_b)
-        if k == 0 and not touches:
-            n = loop
-        if k == 0 or contrary or wp.dot(n, loop) > LIKENESS:
-            tight = k > 0 or touches
-            depth = measure_column(pair, n, normal_a, normal_b, wp.where(tight, wp.min(least, -slack), least)).depth
-            if k == 0 or (depth >= -slack and (best_depth < -slack or depth <= best_depth + slack)):
-                best_n = n
-                best_depth = depth
-        k += 1
-    best, _ = make_column(pair, best_n, normal_a, normal_b)
-    best.depth = best_depth
-    return best
+
+@wp.func
+def load_crossing(i: wp.int32, trees: Trees, batch: PairBatch, faces: wp.vec3i, contacts: Contacts):
+    """Return the faces of contact i."""
+    a = wp.min(batch.pairs[faces[0]][0], batch.pairs[faces[0]][1])
+    return load_pair(trees, batch.poses[faces[0]], a, faces, contacts.normal_a[i], contacts.normal_b[i])
 
 
 @wp.kernel(cuda_max_registers=128)
@@ -198,35 +118,68 @@ def offer_crossing_kernel(
     """Offer the candidates of one contact of faces that cross a thread to the slots of its pair.
 
     Args:
-        gap: How far outside points may be, of faces that look at one another [world units], shape [pair]; [0] for not
-            at all.
+        gap: Of pairs, as for `offer_crossing`, shape [pair]; [0] for none.
         start, faces, order: Contacts of pairs, as for `loops`, in the order of loops.
     """
     if wp.tid() >= start[start.shape[0] - 1]:
         return
     i = order[wp.tid()]
-    crossing = load_crossing(i, batch, gap, faces[i], contacts)
-    p = faces[i][0]
-    pose = batch.poses[p]
-    column = measure_crossing(crossing, trees, pose, contacts, curves)
-    sense = wp.where(pose.swapped != 0, wp.float64(-1.0), wp.float64(1.0))
-    weight, directions = slots_inout.weight[p], slots_inout.directions
-    bin, scores = find_bin(wp.vec3(sense * column.normal), directions), no_scores()
-    centre = trees.models.centre[trees.states.model[trees.objects.state[crossing.a]]]
-    if column.depth == NO_DEPTH:
-        # Behind whatever has a depth.
-        rate_point(wp.vec3(), NO_DEPTH_SEPARATION, weight, bin, directions, scores)
-    k = wp.int32(0)
-    while k < POSSIBLE_CORNERS and column.depth > NO_DEPTH:
-        point, depth, exists = column_corner(column, k)
-        if exists and depth >= crossing.least:
-            x, s = wp.vec3((point - centre) * pose.scale), wp.float32(-depth * pose.scale)
-            rate_point(x, s, weight, bin, directions, scores)
-        k += 1
-    offer_scores(scores, bin, i, p, slots_inout.key)
+    p, root = faces[i][0], curves.loop[i]
+    pair, has_area = load_crossing(i, trees, batch, faces[i], contacts), curves.has_area[root] != 0
+    loop, shell = curves.loop_normal[root], gap_of(gap, p)
+    offer_crossing(trees, batch.poses[p], pair, loop, has_area, shell, i, p, slots_inout)
+
+
+@native.func_native(cpu=True)
+def simd_offer_crossing(
+    trees: Trees,
+    pose: PairPose,
+    a: wp.int32,
+    gap: wp.float64,
+    pair: wp.int32,
+    span: wp.vec2i,
+    faces: wp.array(dtype=wp.vec3i),
+    contacts: Contacts,
+    curves: Curves,
+    slots: Slots,
+):
+    """Offer the contacts of an object pair, as `offer_crossing_kernel`, 8 at a time.
+
+    Args:
+        a: Object A.
+        span: First contact, and the one behind the last.
+    """
 
 
 @wp.kernel
+def offer_pair_crossing_kernel(
+    trees: Trees,
+    batch: PairBatch,
+    gap: wp.array(dtype=wp.float64),
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    contacts: Contacts,
+    curves: Curves,
+    slots_inout: Slots,
+):
+    """Offer the contacts of one object pair, as `offer_crossing_kernel`; one thread after the other, CPU only."""
+    p = wp.tid()
+    if start[p] < start[p + 1]:
+        a, span = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.vec2i(start[p], start[p + 1])
+        shell = gap_of(gap, p)
+        simd_offer_crossing(trees, batch.poses[p], a, shell, p, span, faces, contacts, curves, slots_inout)
+
+
+@wp.func
+def write_middle(w: wp.int32, i: wp.int32, contacts: Contacts, witnesses: Witnesses):
+    """Write the middle and an end of contact i as candidates, which have no depth."""
+    for k in range(COLUMN_CORNERS):
+        witnesses.depth[w, k] = wp.where(k < 2, NO_DEPTH, NO_POINT)
+    witnesses.point[w, 0] = wp.float64(0.5) * (contacts.p0[i] + contacts.p1[i])
+    witnesses.point[w, 1] = contacts.p1[i]
+
+
+@wp.kernel(cuda_max_registers=216)
 def find_crossing_kernel(
     trees: Trees,
     batch: PairBatch,
@@ -248,10 +201,8 @@ def find_crossing_kernel(
             witnesses_out.depth[w, k] = NO_POINT
     if item[0] < 0 or item[0] >= NEAR_BIT:
         return
-    crossing = load_crossing(item[1], batch, gap, faces[item[1]], contacts)
-    column = measure_crossing(crossing, trees, batch.poses[item[0]], contacts, curves)
-    rotation, position = trees.objects.rotation[crossing.a], trees.objects.position[crossing.a]
-    if column.depth == NO_DEPTH:
-        write_middle(w, crossing.i, rotation * column.normal, contacts, witnesses_out)
-    else:
-        write_candidates(w, rotation, position, column, crossing.least, witnesses_out)
+    i, root = item[1], curves.loop[item[1]]
+    pair, has_area = load_crossing(i, trees, batch, faces[i], contacts), curves.has_area[root] != 0
+    loop, shell = curves.loop_normal[root], gap_of(gap, item[0])
+    if not find_crossing(trees.objects, pair, loop, has_area, shell, w, witnesses_out):
+        write_middle(w, i, contacts, witnesses_out)

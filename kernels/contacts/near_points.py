@@ -11,19 +11,17 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, Trees
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
-from warp_abtree.kernels.contacts.column import COLUMN_CORNERS, NO_DEPTH, column_slack, load_pair, measure_column
+from warp_abtree.kernels.contacts.column import COLUMN_CORNERS, FacePair, load_pair
 from warp_abtree.kernels.contacts.contact import Contacts, contact_objects
-from warp_abtree.kernels.contacts.manifold import NO_POINT, Witnesses, write_candidates
+from warp_abtree.kernels.contacts.manifold import NO_POINT, Witnesses
 from warp_abtree.kernels.contacts.separation import write_near_contact
 from warp_abtree.kernels.contacts.slots import WitnessRows
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK, Hits
 
-wp.set_module_options(native.options("exact/double_word.cuh"))
+wp.set_module_options(native.options("contacts/candidates.cuh", "exact/double_word.cuh"))
 
 # A face's normal serves where the other face looks against it within 60 degrees.
 OPPOSED_LEAST = wp.constant(wp.float64(0.5))
-# Part of the distance that the gap along a face's normal differs by, where that is the direction of the distance.
-ALIKE = wp.constant(wp.float64(2.0**-10))
 # Cosine between a face's normal and the direction of the distance under which the gap differs by more than `ALIKE`.
 ALONG = wp.constant(wp.float64(0.998))
 
@@ -58,42 +56,15 @@ def write_nearest_points(
         witnesses.point[w, 0] = pose_point(rotation, position, middle)
 
 
-@wp.func
-def write_facing(
-    w: wp.int32,
-    gap: wp.float64,
-    trees: Trees,
-    a: wp.int32,
-    pose: PairPose,
-    faces: wp.vec3i,
-    contacts: Contacts,
-    witnesses: Witnesses,
-):
+@native.func_native()
+def find_facing(
+    objects: ObjectPool, pair: FacePair, gap: wp.float64, separation: wp.float64, w: wp.int32, witnesses: Witnesses
+) -> bool:
     """Write the corners of the column of faces that look at one another as candidates; return whether they serve.
 
     Along the normal of either face, whichever leaves the wider gap, if that is the distance. A face that lies behind
     the other one's plane is inside, as deep as it is far.
-
-    Args:
-        a: Object in whose frame the pose is.
     """
-    rotation = trees.objects.rotation[a]
-    back = wp.transpose(rotation)
-    pair = load_pair(trees, pose, faces)
-    normal_a, normal_b = back * contacts.normal_a[w], back * contacts.normal_b[w]
-    separation = contacts.separation[w]
-    slack = wp.max(ALIKE * separation, column_slack(pair))
-    best = measure_column(pair, normal_a, normal_a, normal_b, -gap)
-    # A gap wider than the distance stays so whatever the other normal says.
-    if best.depth == NO_DEPTH or -best.depth - separation <= slack:
-        other = measure_column(pair, -normal_b, normal_a, normal_b, -gap)
-        if other.depth > NO_DEPTH and (best.depth == NO_DEPTH or other.depth < best.depth):
-            best = other
-    serves = wp.abs(wp.abs(best.depth) - separation) <= slack
-    if serves:
-        witnesses.nearest_only[w] = wp.where(best.depth > slack, 1, 0)
-        write_candidates(w, rotation, trees.objects.position[a], best, -gap, witnesses)
-    return serves
 
 
 @wp.kernel(cuda_max_registers=128)
@@ -136,6 +107,7 @@ def find_near_witness_kernel(
             witnesses_out.depth[w, k] = NO_POINT
         served = bool(True)
     elif -wp.dot(normal_a, normal_b) >= OPPOSED_LEAST and (along >= ALONG or touch):
-        served = write_facing(w, gap[p], trees, own.a, pose, item, contacts_out, witnesses_out)
+        pair = load_pair(trees, pose, own.a, item, normal_a, normal_b)
+        served = find_facing(trees.objects, pair, gap[p], contacts_out.separation[w], w, witnesses_out)
     if not served:
         write_nearest_points(w, trees.objects, own.a, pose, contacts_out, witnesses_out)

@@ -36,7 +36,6 @@ wp.set_module_options(native.options("base/lanes.cuh", "contacts/near_offer.cuh"
 NORMAL_BINS, SCORES = native.constant("NORMAL_BINS"), native.constant("SCORES")
 SLOTS_A_BIN, SLOT_ROOM = native.constant("SLOTS_A_BIN"), native.constant("SLOT_ROOM")
 ALL_SLOTS = wp.constant(wp.int64(SLOT_ROOM))
-nine_scores = wp.types.vector(length=9, dtype=wp.float32)
 # Directions count so much at least, where gaps are tiny.
 WEIGHT_LEAST = wp.constant(wp.float64(2.0**-8))
 
@@ -75,32 +74,6 @@ def offer_faces(
     slots: wp.array(dtype=wp.int64),
 ):
     """Offer a face pair that is apart, in A's frame at unit size, to the slots of its object pair."""
-
-
-@native.func_native()
-def find_bin(normal: wp.vec3, directions: wp.array(dtype=wp.float32)) -> wp.int32:
-    """Return nine times the bin of a normal."""
-
-
-@native.func_native()
-def no_scores() -> nine_scores: ...
-
-
-@native.func_native()
-def rate_point(
-    point: wp.vec3,
-    separation: wp.float32,
-    weight: wp.float32,
-    bin: wp.int32,
-    directions: wp.array(dtype=wp.float32),
-    scores: wp.ref[nine_scores],
-):
-    """Raise the scores of a crossing contact to those of a point of it, in A's frame at unit size."""
-
-
-@native.func_native()
-def offer_scores(scores: nine_scores, bin: wp.int32, place: wp.int32, pair: wp.int32, slots: wp.array(dtype=wp.int64)):
-    """Offer a crossing contact with the scores of its points to the slots of its object pair."""
 
 
 @wp.func

@@ -49,7 +49,7 @@ def part_uncertain(
     met_inout: wp.array(dtype=wp.int64),
     apart_inout: wp.array(dtype=wp.int64),
 ):
-    """Decide uncertain face pairs by exact signs, and add each to those that have met or to those that are apart."""
+    """Decide inexact face pairs by exact signs, and add each to those that have met or to those that are apart."""
     for i in range(count):
         item = uncertain[i]
         if test_faces(EXACT, trees, pose, item_first(item), item_second(item)) == 1:

@@ -24,8 +24,9 @@ from warp_abtree.kernels.intersect.relative_pose import pairs_starter
 from warp_abtree.kernels.search.item import item_first, item_second
 from warp_abtree.kernels.search.thread_search import THREAD_HEADERS, FaceTests, ThreadPolicy, thread_search
 
-FILTERS = ("exact/determinant.cuh", "intersect/float32_filter.h")  # headers of all policies
-HIT_FILTERS = (*FILTERS, "intersect/float64_filter.h", "intersect/near_filter.h")
+# Headers of all policies.
+FILTERS = ("exact/determinant.cuh", "intersect/float32_filter.h", "intersect/float64_filter.h")
+HIT_FILTERS = (*FILTERS, "intersect/near_filter.h")
 wp.set_module_options(native.options(*THREAD_HEADERS, *HIT_FILTERS))
 
 
@@ -69,14 +70,19 @@ def simd_float64_filter(
     states: StatePool,
     pose: PairPose,
     first_ends: bool,
+    lists_apart: bool,
     found: wp.ref[Filtered],
     uncertain: wp.array(dtype=wp.int64),
     faces: wp.array(dtype=wp.int64),
+    apart: wp.array(dtype=wp.int64),
 ):
     """Test uncertain face pairs in float64, 8 at a time, perhaps until the first that meet, and list those that meet.
 
-    The same as `float64_filter_triangles`. The two lists differ, and have room for 8 more. Those that are still
-    uncertain then are inexact, and stand in front of their list.
+    The same as `float64_filter_triangles`. Lists differ, and have room for 8 more. Those that are still uncertain then
+    are inexact, and stand in front of their list.
+
+    Args:
+        lists_apart: Whether those that are apart are added to a list.
     """
 
 
@@ -134,7 +140,9 @@ def resolve_uncertain(
     Not inlined: compiling takes less long, and most calls of its caller have none.
     """
     if mode == EXACT:
-        simd_float64_filter(trees.models, trees.states, pose, output == OUTPUT_ANY, found, uncertain, met_inout)
+        simd_float64_filter(
+            trees.models, trees.states, pose, output == OUTPUT_ANY, False, found, uncertain, met_inout, uncertain
+        )
         tests.float64 += wp.int64(found.tested)
         tests.exact += resolve_faces(mode, output, trees, pose, found.uncertain, uncertain, found.met, met_inout)
     else:
@@ -186,10 +194,12 @@ def test_gap_pairs(
     error, unit = float32_bounds(EXACT, pose)
     bounds = wp.vec3(error, unit, scaled_gap(pose))
     simd_float32_filter(trees.models, trees.states, pose, bounds, False, waiting, faces, uncertain, apart, found)
-    part_uncertain(trees, pose, found.uncertain, uncertain, found.met, found.apart, faces, apart)
     tests.total += wp.int64(found.tested)
-    tests.float64 += wp.int64(found.uncertain)
-    tests.exact += wp.int64(found.uncertain)
+    if found.uncertain > 0:
+        tests.float64 += wp.int64(found.uncertain)
+        simd_float64_filter(trees.models, trees.states, pose, False, True, found, uncertain, faces, apart)
+        tests.exact += wp.int64(found.uncertain)
+        part_uncertain(trees, pose, found.uncertain, uncertain, found.met, found.apart, faces, apart)
 
 
 @wp.func

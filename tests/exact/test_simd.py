@@ -63,7 +63,7 @@ def ask_one_by_one(kernel, *inputs, items):
 
 def ask_at_once(kernel, *inputs):
     """Return the counts of a kernel of one thread."""
-    counts = wp.zeros(3, dtype=wp.int64, device=CPU)
+    counts = wp.zeros(4, dtype=wp.int64, device=CPU)
     wp.launch(kernel, 1, [*inputs, counts], device=CPU)
     return counts.numpy()
 
@@ -82,6 +82,7 @@ def write_filtered(found: Filtered, count: Items):
     count[0] = wp.int64(found.met)
     count[1] = wp.int64(found.uncertain)
     count[2] = wp.int64(found.tested)
+    count[3] = wp.int64(found.apart)
 
 
 @wp.kernel
@@ -124,7 +125,7 @@ def test_float32_filter_is_the_same_as_one_by_one(kind, posed):
         for first_ends in (False, True):
             items, left = filled(OVER, asked), filled(ask_count + OVER)
             unit = 0.0 if error == 0.0 else float(FLOAT32_UNIT)
-            met, uncertain, tested = ask_at_once(float32_all_kernel, first_ends, unit, placed, items, left)
+            met, uncertain, tested, _ = ask_at_once(float32_all_kernel, first_ends, unit, placed, items, left)
             hit = np.flatnonzero(meet == 1)
             ends = first_ends and len(hit) > 0
             assert tested == (min(ask_count, 16 * (hit[0] // 16 + 1)) if ends else ask_count)
@@ -146,12 +147,16 @@ def float64_one_kernel(posed: Posed, items: Items, meet_out: wp.array2d[int]):
 
 
 @wp.kernel
-def float64_all_kernel(first_ends: bool, met: int, waiting: int, posed: Posed, left: Items, faces: Items, count: Items):
+def float64_all_kernel(
+    first_ends: bool, met: int, waiting: int, posed: Posed, left: Items, faces: Items, apart: Items, count: Items
+):
+    """Filter so many face pairs, and list those that are apart where the first that meets does not end it."""
     models, states, pose = posed.trees.models, posed.trees.states, posed.pose
     found = Filtered()
     found.met = met
+    found.apart = met
     found.uncertain = waiting
-    simd_float64_filter(models, states, pose, first_ends, found, left, faces)
+    simd_float64_filter(models, states, pose, first_ends, not first_ends, found, left, faces, apart)
     write_filtered(found, count)
 
 
@@ -229,8 +234,9 @@ def test_float64_filter_is_the_same_as_one_by_one(kind, outcomes):
     # As they come, and the uncertain ones first, so that a search for a first hit gets that far.
     for first_ends, order in ((False, np.s_[:]), (True, np.s_[:]), (True, np.argsort(~uncertain, kind="stable"))):
         items, hit, inexact = asked[order], met[order], uncertain[order]
-        left, faces = filled(OVER, items), filled(before + ask_count + OVER)
-        end, still_open, tested = ask_at_once(float64_all_kernel, first_ends, before, ask_count, placed, left, faces)
+        left, (faces, apart) = filled(OVER, items), (filled(before + ask_count + OVER) for _ in range(2))
+        inputs = first_ends, before, ask_count, placed, left, faces, apart
+        end, still_open, tested, apart_end = ask_at_once(float64_all_kernel, *inputs)
         ends = first_ends and hit.any()
         assert tested == (min(ask_count, 8 * (np.flatnonzero(hit)[0] // 8 + 1)) if ends else ask_count)
         first = np.arange(ask_count) < tested
@@ -238,6 +244,12 @@ def test_float64_filter_is_the_same_as_one_by_one(kind, outcomes):
         np.testing.assert_array_equal(np.sort(left.numpy()[:still_open]), np.sort(items[first & inexact]))
         assert (faces.numpy()[:before] == UNTOUCHED).all() and (faces.numpy()[end + 8 :] == UNTOUCHED).all()
         assert (left.numpy()[ask_count + 8 :] == UNTOUCHED).all()
+        found = apart.numpy()
+        if first_ends:
+            assert (found == UNTOUCHED).all()
+        else:
+            np.testing.assert_array_equal(np.sort(found[before:apart_end]), np.sort(items[~hit & ~inexact]))
+            assert (found[:before] == UNTOUCHED).all() and (found[apart_end + 8 :] == UNTOUCHED).all()
     seen = {"met": met, "apart": plain == 0, "left": uncertain}
     assert all(seen[name].sum() > 30 for name in outcomes.split())
 
@@ -280,7 +292,7 @@ def test_descends_as_node_pair_tests_do(names):
             stack, faces = filled(CPU_STACK_LENGTH + 64), filled(WAITING_LENGTH + 64)
             found = wp.empty(10**7, dtype=wp.int64, device=CPU)
             inputs = wp.vec3i(*way), query.batch.states.pool, query.pair_poses, stack, faces, found
-            count, compared, _ = ask_at_once(descend_kernel, *inputs)
+            count, compared, *_ = ask_at_once(descend_kernel, *inputs)
             assert count == way[0] * result.triangle_tests[0] > 0
             if plain is None:
                 plain, tests = np.sort(found.numpy()[:count]), compared

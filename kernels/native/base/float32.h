@@ -32,6 +32,7 @@ struct Float32 {
     typedef bool flags __attribute__((ext_vector_type(16)));
     typedef float four __attribute__((vector_size(16)));
     typedef float eight __attribute__((vector_size(32)));
+    typedef int eight_ints __attribute__((vector_size(32)));
     typedef unsigned int sixteen[16];
     struct Point {
         lanes x, y, z;
@@ -49,9 +50,16 @@ struct Float32 {
             x[k] = from[at[k]];
         return x;
     }
+    static eight pick(const float* from, const eight_ints& at) {
+        eight x;
+        for (int k = 0; k < 8; ++k)
+            x[k] = from[at[k]];
+        return x;
+    }
     static lanes absolute(const lanes& v) { return __builtin_elementwise_abs(v); }
     static lanes fuse(const lanes& a, const lanes& b, const lanes& c) { return __builtin_elementwise_fma(a, b, c); }
     static float fuse(float a, float b, float c) { return __builtin_fmaf(a, b, c); }
+    static eight fuse(const eight& a, const eight& b, const eight& c) { return __builtin_elementwise_fma(a, b, c); }
     static lanes sum_sizes(const Point& v) { return (absolute(v.x) + absolute(v.y)) + absolute(v.z); }
     static Point minus(const Point& a, const Point& b) { return Point{a.x - b.x, a.y - b.y, a.z - b.z}; }
     static Point cross(const Point& u, const Point& v) {

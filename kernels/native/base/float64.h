@@ -6,11 +6,21 @@
 struct Lanes64 {
     typedef double lanes __attribute__((vector_size(64)));
     typedef wp::int64 bits __attribute__((vector_size(64)));
+    typedef float floats __attribute__((vector_size(32)));
+    typedef int float_bits __attribute__((vector_size(32)));
+    typedef float_bits integers;
+    typedef bool flags __attribute__((ext_vector_type(8)));
     static lanes absolute(const lanes& v) { return __builtin_elementwise_abs(v); }
     static lanes fuse(const lanes& a, const lanes& b, const lanes& c) { return __builtin_elementwise_fma(a, b, c); }
     static lanes root(const lanes& v) { return __builtin_elementwise_sqrt(v); }
     static bits negate(const bits& flags) { return ~flags; }
     static bool is_all(const bits&) { return false; }  // for a branch that saves nothing here
+    static bool any(const bits& which) { return to_mask(which) != 0; }
+    static unsigned int to_mask(const bits& which) {
+        return (unsigned int)__builtin_bit_cast(unsigned char, __builtin_convertvector(which, flags));
+    }
+    static floats narrow(const lanes& v) { return __builtin_convertvector(v, floats); }
+    static float_bits narrow_bits(const bits& which) { return __builtin_convertvector(which, float_bits); }
     template <class Point>
     static Point divide(const Point& v, const lanes& s) {
         return Point{v.x / s, v.y / s, v.z / s};
@@ -21,7 +31,6 @@ struct Float64 : Points64<Lanes64> {
     typedef wp::int64 loose_longs __attribute__((vector_size(64), aligned(8)));
     typedef int ints __attribute__((vector_size(32)));
     typedef int loose_ints __attribute__((vector_size(32), aligned(4)));
-    typedef bool flags __attribute__((ext_vector_type(8)));
     typedef double four __attribute__((vector_size(32), aligned(8)));
     // Of 8 signs those that are 1, -1 and UNCERTAIN, a bit each.
     struct Sides {
@@ -33,9 +42,6 @@ struct Float64 : Points64<Lanes64> {
         unsigned int first, second, back;
     };
 
-    static unsigned int to_mask(const bits& which) {
-        return (unsigned int)__builtin_bit_cast(unsigned char, __builtin_convertvector(which, flags));
-    }
     static ints widen(unsigned int mask) {
         return -__builtin_convertvector(__builtin_bit_cast(flags, (unsigned char)mask), ints);
     }

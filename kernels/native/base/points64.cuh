@@ -1,15 +1,22 @@
 // Numbers, points and determinants in float64: of one thread, or in lanes of the CPU (`Float64`). No rounding differs.
 #pragma once
 #include "builtin.h"
+#include "base/sizes.h"
 
 struct Number64 {
     typedef double lanes;
     typedef bool bits;
+    typedef float floats;
+    typedef bool float_bits;
+    typedef int integers;
     static CUDA_CALLABLE double absolute(double v) { return fabs(v); }
     static CUDA_CALLABLE double fuse(double a, double b, double c) { return fma(a, b, c); }
     static CUDA_CALLABLE double root(double v) { return sqrt(v); }
     static CUDA_CALLABLE bool negate(bool flag) { return !flag; }
     static CUDA_CALLABLE bool is_all(bool flag) { return flag; }
+    static CUDA_CALLABLE bool any(bool flag) { return flag; }
+    static CUDA_CALLABLE float narrow(double v) { return (float)v; }
+    static CUDA_CALLABLE bool narrow_bits(bool flag) { return flag; }
 #if defined(__CUDA_ARCH__)
     // Exponents that leave room for remainders.
     static CUDA_CALLABLE bool is_usual(double x) { return ((__double2hiint(x) >> 20) & 2047) - 523u < 1000u; }
@@ -53,6 +60,7 @@ struct Points64 : Number {
     using Number::absolute;
     using Number::divide;
     using Number::fuse;
+    using Number::negate;
     struct Point {
         lanes x, y, z;
     };
@@ -66,7 +74,29 @@ struct Points64 : Number {
     static CUDA_CALLABLE Point choose(const bits& which, const Point& a, const Point& b) {
         return Point{which ? a.x : b.x, which ? a.y : b.y, which ? a.z : b.z};
     }
+    static CUDA_CALLABLE lanes lesser(const lanes& a, const lanes& b) { return b < a ? b : a; }
+    static CUDA_CALLABLE lanes greater(const lanes& a, const lanes& b) { return a < b ? b : a; }
+    static CUDA_CALLABLE Point negate(const Point& v) { return Point{-v.x, -v.y, -v.z}; }
     static CUDA_CALLABLE lanes dot(const Point& a, const Point& b) { return (a.x * b.x + a.y * b.y) + a.z * b.z; }
+    static CUDA_CALLABLE Point cross(const Point& a, const Point& b) {
+        return Point{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+    }
+    // By columns, as Warp multiplies; and by the transpose.
+    static CUDA_CALLABLE Point turn(const double (&m)[3][3], const Point& v) {
+        return Point{(m[0][0] * v.x + m[0][1] * v.y) + m[0][2] * v.z, (m[1][0] * v.x + m[1][1] * v.y) + m[1][2] * v.z,
+                     (m[2][0] * v.x + m[2][1] * v.y) + m[2][2] * v.z};
+    }
+    static CUDA_CALLABLE Point turn_back(const double (&m)[3][3], const Point& v) {
+        return Point{(m[0][0] * v.x + m[1][0] * v.y) + m[2][0] * v.z, (m[0][1] * v.x + m[1][1] * v.y) + m[2][1] * v.z,
+                     (m[0][2] * v.x + m[1][2] * v.y) + m[2][2] * v.z};
+    }
+    // As `pose_point`.
+    static CUDA_CALLABLE Point pose(const double (&m)[3][3], const wp::vec3d& t, const Point& p) {
+        const Point v = turn(m, p);
+        const lanes x = v.x + t[0], y = v.y + t[1], z = v.z + t[2], zero = {};
+        return Point{absolute(x) < COORDINATE_MIN ? zero : x, absolute(y) < COORDINATE_MIN ? zero : y,
+                     absolute(z) < COORDINATE_MIN ? zero : z};
+    }
     static CUDA_CALLABLE lanes largest(const Point& v) {
         const lanes x = absolute(v.x), y = absolute(v.y), z = absolute(v.z), m = x >= y ? x : y;
         return m >= z ? m : z;

@@ -1,4 +1,4 @@
-// One pass of a radix sort on the CPU.
+// Radix sort on the CPU, in the caches.
 #pragma once
 #include "builtin.h"
 
@@ -14,4 +14,20 @@ inline void sort_digit(const unsigned long long* from, unsigned long long* to, i
     }
     for (int i = 0; i < count; ++i)
         to[place[from[i] >> shift & 255]++] = from[i];
+}
+
+// Sorts words by all bits from one on, by way of as much scratch; returns which of the two holds them.
+inline unsigned long long* sort_words(unsigned long long* words, unsigned long long* scratch, int count, int first) {
+    unsigned long long varied = 0;
+    for (int i = 1; i < count; ++i)
+        varied |= words[i] ^ words[0];
+    for (int shift = first; shift < 64; shift += 8) {
+        if ((varied >> shift & 255) == 0)
+            continue;
+        sort_digit(words, scratch, count, shift);
+        unsigned long long* const last = words;
+        words = scratch;
+        scratch = last;
+    }
+    return words;
 }

@@ -154,6 +154,8 @@ constexpr int NORMAL_BINS = 20;
 constexpr int SCORES = 9;
 constexpr int SLOTS_A_BIN = 19;
 constexpr int SLOT_ROOM = 380;
+// Corners of a triangle within the column of another, at most: candidates of a witness.
+constexpr int COLUMN_CORNERS = 6;
 static_assert(SLOTS_A_BIN == 2 * SCORES + 1, "no gap");
 static_assert(SLOT_ROOM == NORMAL_BINS * SLOTS_A_BIN, "no gap");
 

@@ -8,18 +8,6 @@
 struct Contact64 : SharedSegment<Lanes64> {
     typedef Float64 F;
 
-    static Point negate(const Point& v) { return Point{-v.x, -v.y, -v.z}; }
-    // By columns, as Warp multiplies.
-    static Point turn(const double (&m)[3][3], const Point& v) {
-        return Point{(m[0][0] * v.x + m[0][1] * v.y) + m[0][2] * v.z, (m[1][0] * v.x + m[1][1] * v.y) + m[1][2] * v.z,
-                     (m[2][0] * v.x + m[2][1] * v.y) + m[2][2] * v.z};
-    }
-    static Point pose(const double (&m)[3][3], const wp::vec3d& t, const Point& p) {
-        const Point v = turn(m, p);
-        const lanes x = v.x + t[0], y = v.y + t[1], z = v.z + t[2];
-        return Point{F::absolute(x) < COORDINATE_MIN ? lanes{} : x, F::absolute(y) < COORDINATE_MIN ? lanes{} : y,
-                     F::absolute(z) < COORDINATE_MIN ? lanes{} : z};
-    }
     // Without double words where it does not extend: of triangle c and d, with u, v and w their differences, perhaps
     // all turned round. Adds the lanes that it is not sure of to a mask.
     static lanes filter_volume(bool extends, const Point (&c)[3], const Point& d, const Point& u, const Point& v,
@@ -49,9 +37,6 @@ struct Contact64 : SharedSegment<Lanes64> {
     static Point blend_normals(const Point& normal_a, const Point& normal_b) {
         const Point normal = F::minus(normal_a, normal_b);
         return unit_vector(F::choose(dot(normal, normal) <= SHORTEST_NORMAL * SHORTEST_NORMAL, normal_a, normal));
-    }
-    static Point cross(const Point& a, const Point& b) {
-        return Point{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
     }
     // 1 where faces intersect, 0 where a gap lies between them.
     static void load_crossed(const double* separation, bool with_gap, int first, int count, lanes& crossed) {
@@ -85,5 +70,35 @@ struct Contact64 : SharedSegment<Lanes64> {
         *(loose*)numbers = __builtin_shufflevector(xy_low, p.z, 0, 1, 8, 2, 3, 9, 4, 5);
         *(loose*)(numbers + 8) = __builtin_shufflevector(xy_middle, p.z, 10, 1, 2, 11, 3, 4, 12, 5);
         *(loose*)(numbers + 16) = __builtin_shufflevector(xy_high, p.z, 3, 13, 4, 5, 14, 6, 7, 15);
+    }
+};
+
+// Corners of face pairs that have contacts.
+template <class PairPose>
+struct ContactFaces {
+    typedef Float64 F;
+    typedef F::Point Point;
+    const PairPose& pose;
+    const wp::vec3i* faces;
+    const double* vertices;
+    const wp::vec4i* corners;
+
+    // Of so many, of A and of B, in A's frame; the first in the place of those that lack.
+    void load(const int* hit, int count, Point (&a)[3], Point (&b)[3]) const {
+        const bool back = pose.swapped != 0;
+        int start[6][8];
+        for (int k = 0; k < 8; ++k) {
+            const wp::vec3i& pair = faces[hit[k < count ? k : 0]];
+            const wp::vec4i& a = corners[pose.corner_a + pair[back ? 2 : 1]];
+            const wp::vec4i& b = corners[pose.corner_b + pair[back ? 1 : 2]];
+            for (int i = 0; i < 3; ++i) {
+                start[i][k] = 4 * a[i];
+                start[3 + i][k] = 4 * b[i];
+            }
+        }
+        for (int i = 0; i < 3; ++i) {
+            a[i] = F::gather(vertices, start[i]);
+            b[i] = F::pose(pose.rotation.data, pose.translation, F::gather(vertices, start[3 + i]));
+        }
     }
 };

@@ -15,29 +15,10 @@ struct ContactFinder {
     const Contacts& contacts;
     const wp::mat33d& rotation;
     const wp::vec3d& position;
-    const wp::vec3i* faces;
-    const double* vertices;
-    const wp::vec4i* corners;
+    const ContactFaces<PairPose> faces;
     bool proven, with_gap, back;
     wp::vec3d* target[5];
 
-    // Corners of so many face pairs, in A's frame.
-    void load(const int* hit, int count, Point (&a)[3], Point (&b)[3]) const {
-        int start[6][8];
-        for (int k = 0; k < 8; ++k) {
-            const wp::vec3i& pair = faces[hit[k < count ? k : 0]];
-            const wp::vec4i& a = corners[pose.corner_a + pair[back ? 2 : 1]];
-            const wp::vec4i& b = corners[pose.corner_b + pair[back ? 1 : 2]];
-            for (int i = 0; i < 3; ++i) {
-                start[i][k] = 4 * a[i];
-                start[3 + i][k] = 4 * b[i];
-            }
-        }
-        for (int i = 0; i < 3; ++i) {
-            a[i] = F::gather(vertices, start[i]);
-            b[i] = C::pose(pose.rotation.data, pose.translation, F::gather(vertices, start[3 + i]));
-        }
-    }
     void store(const int* hit, int count, const Point (&found)[5]) const {
         if (count == 8 && hit[7] - hit[0] == 7) {
             for (int i = 0; i < 5; ++i)
@@ -57,7 +38,7 @@ struct ContactFinder {
     // Those of faces that are apart; what it is not sure of keeps its mark.
     void find_near(const int* hit, int count) const {
         Point a[3], b[3], of_b[3];
-        load(hit, count, a, b);
+        faces.load(hit, count, a, b);
         for (int i = 0; i < 3; ++i)
             of_b[i] = F::minus(b[i], a[0]);
         const Depth64::Scaled t = Depth64::scale(a, of_b);
@@ -78,15 +59,15 @@ struct ContactFinder {
         for (int k = 0; k < count; ++k)
             contacts.separation.data[hit[k]] = separation[k] > LEAST_SEPARATION ? separation[k] : LEAST_SEPARATION;
     }
-    // So many face pairs; returns those that it is not sure of, a bit each.
-    unsigned int find(bool extends, const int* hit, int count) const {
+    // So many face pairs, perhaps with double words; returns those that it is not sure of, a bit each.
+    unsigned int find(bool extends, bool again, const int* hit, int count) const {
         Point a[3], b[3], d[3][3];
-        load(hit, count, a, b);
+        faces.load(hit, count, a, b);
         // From each corner of A to each of B: the other way round, every rounding is the same.
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j)
                 d[i][j] = F::minus(b[j], a[i]);
-        if (with_gap && !extends) {
+        if (with_gap && !again) {
             const lanes depth = Depth64::measure(Depth64::scale(a, d[0]));
             for (int k = 0; k < count; ++k)
                 contacts.separation.data[hit[k]] = -(depth[k] < LEAST_SEPARATION ? LEAST_SEPARATION : depth[k]);
@@ -126,16 +107,16 @@ wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const 
         contacts,
         rotation,
         position,
-        faces.data,
-        (const double*)models.vertex_pos.data,
-        states.face_corner.data,
+        {pose, faces.data, (const double*)models.vertex_pos.data, states.face_corner.data},
         proven,
         with_gap,
         pose.swapped != 0,
         {contacts.p0.data, contacts.p1.data, contacts.normal_a.data, contacts.normal_b.data, contacts.normal.data}};
     // First without double words, then with them those that need them, side by side: on the list, which they leave.
+    // With them at once where most do, as of what touches, which one of eight vectors tells.
     int* list = place.data + span[2];
-    int from = span[0], count = 0, apart = 0, left = 0, hit[8], near[8];
+    int from = span[0], count = 0, apart = 0, left = 0, vectors = 0, hit[8], near[8];
+    bool extends = false;
     for (; from < span[1]; ++from) {
         if (!with_gap || contacts.separation.data[from] < 0.0)
             hit[count++] = from;
@@ -146,7 +127,11 @@ wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const 
             apart = 0;
         }
         if (count == 8 || (count > 0 && from + 1 == span[1])) {
-            for (unsigned int open = finder.find(false, hit, count); open != 0; open &= open - 1)
+            const bool tells = vectors++ % 8 == 0;
+            unsigned int open = finder.find(extends && !tells, false, hit, count);
+            if (tells)
+                extends = 2 * __builtin_popcount(open) > count;
+            for (; open != 0; open &= open - 1)
                 list[left++] = hit[__builtin_ctz(open)];
             count = 0;
         }
@@ -156,7 +141,7 @@ wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const 
         count = left - i < 8 ? left - i : 8;
         for (int k = 0; k < count; ++k)
             hit[k] = list[i + k];
-        for (unsigned int open = finder.find(true, hit, count); open != 0; open &= open - 1)
+        for (unsigned int open = finder.find(true, true, hit, count); open != 0; open &= open - 1)
             place.data[result++] = hit[__builtin_ctz(open)];
     }
     return result;

@@ -12,8 +12,6 @@ struct Depth64 {
 
     lanes square = lanes{} - 1.0, length = {};  // of the widest gap yet
 
-    static lanes lesser(const lanes& a, const lanes& b) { return b < a ? b : a; }
-    static lanes greater(const lanes& a, const lanes& b) { return a < b ? b : a; }
     static Point scaled(const Point& v, const lanes& s) { return Point{v.x * s, v.y * s, v.z * s}; }
     static lanes minor_exactly(const lanes& a, const lanes& b, const lanes& c, const lanes& d) {
         const lanes w = c * d;
@@ -29,19 +27,19 @@ struct Depth64 {
         return power > 0.0 ? power : lanes{} + 1.0;
     }
     void offer_gap(const Point& n, const lanes& low, const lanes& high) {
-        const lanes gap = greater(-high, low), n_length = C::dot(n, n), n_square = gap * F::absolute(gap);
+        const lanes gap = F::greater(-high, low), n_length = C::dot(n, n), n_square = gap * F::absolute(gap);
         const bits wider = n_square * length > square * n_length;
         square = wider ? n_square : square;
         length = wider ? n_length : length;
     }
     void offer_face(const Point& n, const Point& x, const Point& y, const Point& z) {
         const lanes p = C::dot(n, x), q = C::dot(n, y), r = C::dot(n, z);
-        offer_gap(n, lesser(p, lesser(q, r)), greater(p, greater(q, r)));
+        offer_gap(n, F::lesser(p, F::lesser(q, r)), F::greater(p, F::greater(q, r)));
     }
     void offer_edges(const Point& e, const Point& f, const lanes& a, const lanes& b, const Point& r) {
         const Point n = C::cross(e, f);
         const lanes z = C::dot(n, r), zero = {};
-        offer_gap(n, z + lesser(b, zero) - greater(a, zero), z + greater(b, zero) - lesser(a, zero));
+        offer_gap(n, z + F::lesser(b, zero) - F::greater(a, zero), z + F::greater(b, zero) - F::lesser(a, zero));
     }
     // As `Triangles`, and their edges.
     struct Scaled {
@@ -51,10 +49,10 @@ struct Depth64 {
     // Of corners of A, and the differences of those of B and A's first one.
     static Scaled scale(const Point (&a)[3], const Point (&of_b)[3]) {
         const Point a1 = F::minus(a[1], a[0]), a2 = F::minus(a[2], a[0]);
-        const lanes of_a = greater(C::largest(a1), C::largest(a2));
-        const lanes last = greater(C::largest(of_b[1]), C::largest(of_b[2]));
+        const lanes of_a = F::greater(C::largest(a1), C::largest(a2));
+        const lanes last = F::greater(C::largest(of_b[1]), C::largest(of_b[2]));
         Scaled t;
-        t.size = power_of_two(greater(of_a, greater(C::largest(of_b[0]), last)));
+        t.size = power_of_two(F::greater(of_a, F::greater(C::largest(of_b[0]), last)));
         const lanes scale = 1.0 / t.size;
         t.a[0] = Point{};
         t.a[1] = scaled(a1, scale);
@@ -80,6 +78,6 @@ struct Depth64 {
                                  i == 0 ? b[j] : F::minus(b[j], t.a[i]));
         const bits some = best.length > 0.0;
         const lanes depth = some ? -best.square / (some ? best.length : lanes{} + 1.0) : lanes{};
-        return C::root(greater(depth, lanes{})) * t.size;
+        return C::root(F::greater(depth, lanes{})) * t.size;
     }
 };

@@ -15,7 +15,7 @@ struct Near64 {
     lanes square = lanes{} + __builtin_inf();
     lanes of_a[3], of_b[3];
 
-    static lanes clamp_unit(const lanes& x) { return D::lesser(D::greater(x, lanes{}), lanes{} + 1.0); }
+    static lanes clamp_unit(const lanes& x) { return F::lesser(F::greater(x, lanes{}), lanes{} + 1.0); }
     static lanes divide(const lanes& a, const lanes& b) {
         const bits some = b > 0.0;
         return some ? a / (some ? b : lanes{} + 1.0) : lanes{};

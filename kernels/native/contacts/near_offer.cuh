@@ -105,25 +105,13 @@ struct NearOffer {
         }
         return scores;
     }
-    // Puts the scores of a lane into the slots of its object pair: of what is inside the deepest alone.
-    static CUDA_CALLABLE void put(const Scores& scores, int lane, const wp::vec2i& widths, int face_a, int face_b,
-                                  wp::int64* slots) {
-        const unsigned long long name = ((unsigned long long)face_a << widths[1]) | (unsigned int)face_b;
-        const int width = widths[0] + widths[1];
-#if defined(__CUDA_ARCH__)
-        if (scores.counts)
-            put_into_slots(slots + SLOTS_A_BIN * (scores.bin / 9) + (scores.inside ? 2 * SCORES : SCORES), scores.score,
-                           scores.inside ? 1 : SCORES, width, name);
-#else
-        if (!scores.counts[lane])
-            return;
-        float own[SCORES];
-        for (int k = 0; k < SCORES; ++k)
-            own[k] = scores.score[k][lane];
-        const bool inside = scores.inside[lane] != 0;
-        put_into_slots(slots + SLOTS_A_BIN * (scores.bin[lane] / 9) + (inside ? 2 * SCORES : SCORES), own,
-                       inside ? 1 : SCORES, width, name);
-#endif
+    // Where the slots are that scores belong in, and how many: of what is inside the deepest alone.
+    static CUDA_CALLABLE int find_slots(int bin, bool inside, int& count) {
+        count = inside ? 1 : SCORES;
+        return SLOTS_A_BIN * (bin / 9) + (inside ? 2 * SCORES : SCORES);
+    }
+    static CUDA_CALLABLE unsigned long long name_of(const wp::vec2i& widths, int face_a, int face_b) {
+        return ((unsigned long long)face_a << widths[1]) | (unsigned int)face_b;
     }
 };
 
@@ -136,5 +124,20 @@ CUDA_CALLABLE void offer_faces(const Corners& a, const Corners& b, wp::float32 g
     spread_corners(a, c.a);
     spread_corners(b, c.b);
     const O::Scores scores = O::rate(c, gap, weight, directions.data);
-    O::put(scores, 0, widths, face_a, face_b, slots.data + (wp::int64)pair * SLOT_ROOM);
+#if defined(__CUDA_ARCH__)
+    const bool counts = scores.counts, inside = scores.inside;
+    const int bin = scores.bin;
+    const float (&own)[SCORES] = scores.score;
+#else
+    const bool counts = scores.counts[0], inside = scores.inside[0];
+    const int bin = scores.bin[0];
+    float own[SCORES];
+    for (int k = 0; k < SCORES; ++k)
+        own[k] = scores.score[k][0];
+#endif
+    if (counts) {
+        int count;
+        wp::int64* const at = slots.data + (wp::int64)pair * SLOT_ROOM + O::find_slots(bin, inside, count);
+        put_into_slots(at, own, count, widths[0] + widths[1], O::name_of(widths, face_a, face_b));
+    }
 }

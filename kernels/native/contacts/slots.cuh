@@ -90,23 +90,47 @@ inline CUDA_CALLABLE void put_into_slots(wp::int64* slots, const float* scores, 
 #endif
 }
 
-typedef SlotScores<float, bool, int> PointScores;
+#if !defined(__CUDA_ARCH__)
+// Scores of several pairs of faces as the high bits of keys, to put them into slots one pair after the other.
+template <class L, class B, class I>
+struct SlotKeys {
+    typedef unsigned int numbers __attribute__((vector_size(sizeof(L))));
+    typedef unsigned int eight __attribute__((vector_size(32)));
+    typedef unsigned long long keys __attribute__((vector_size(64)));
+    typedef unsigned long long loose_keys __attribute__((vector_size(64), aligned(8)));
+    const SlotScores<L, B, I>& scores;
+    const int width;
+    numbers kept[SCORES];
+    I whole;  // whether there are all scores of a pair
 
-inline CUDA_CALLABLE wp::int32 find_bin(wp::vec3 normal, wp::array_t<wp::float32> directions) {
-    return PointScores::find_bin({normal[0], normal[1], normal[2]}, directions.data);
-}
-
-inline CUDA_CALLABLE wp::vec_t<SCORES, wp::float32> no_scores() { return wp::vec_t<SCORES, wp::float32>(NO_SCORE); }
-
-inline CUDA_CALLABLE void rate_point(wp::vec3 point, wp::float32 separation, wp::float32 weight, wp::int32 bin,
-                                     wp::array_t<wp::float32> directions, wp::vec_t<SCORES, wp::float32>& scores) {
-    PointScores own(bin, directions.data);
-    own.offer(weight, {point[0], point[1], point[2]}, separation, true);
-    for (int k = 0; k < SCORES; ++k)
-        scores[k] = own.score[k] > scores[k] ? own.score[k] : scores[k];
-}
-
-inline CUDA_CALLABLE void offer_scores(wp::vec_t<SCORES, wp::float32> scores, wp::int32 bin, wp::int32 place,
-                                       wp::int32 pair, wp::array_t<wp::int64> slots) {
-    put_into_slots(slots.data + (wp::int64)pair * SLOT_ROOM + SLOTS_A_BIN * (bin / 9), &scores[0], SCORES, 32, place);
-}
+    SlotKeys(const SlotScores<L, B, I>& scores, int width) : scores(scores), width(width), whole(I{} - 1) {
+        const int dropped = width > 32 ? width - 32 : 0;
+        for (int k = 0; k < SCORES; ++k) {
+            const numbers x = (numbers)scores.score[k];
+            kept[k] = ((I)x < 0 ? ~x : x | 0x80000000u) >> dropped;
+            whole &= scores.score[k] > NO_SCORE;
+        }
+    }
+    // As `put_into_slots`.
+    void put(wp::int64* slots, int lane, int count, unsigned long long name) const {
+        if (count != SCORES || !whole[lane]) {
+            float own[SCORES];
+            for (int k = 0; k < count; ++k)
+                own[k] = scores.score[k][lane];
+            put_into_slots(slots, own, count, width, name);
+            return;
+        }
+        static_assert(SCORES == 9, "eight and another one");
+        const int shift = width > 32 ? width : 32;
+        const unsigned long long low = ((1ull << width) - 1) & ~name;
+        eight high;
+        for (int k = 0; k < 8; ++k)
+            high[k] = kept[k][lane];
+        const keys key = __builtin_convertvector(high, keys) << shift | low, other = *(const loose_keys*)slots;
+        *(loose_keys*)slots = key > other ? key : other;
+        const unsigned long long last = (unsigned long long)kept[8][lane] << shift | low;
+        if (last > (unsigned long long)slots[8])
+            slots[8] = last;
+    }
+};
+#endif

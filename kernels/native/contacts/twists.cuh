@@ -3,7 +3,7 @@
 #include "builtin.h"
 #include "base/float32.h"
 #include "base/sizes.h"
-#include "contacts/groups.cuh"
+#include "base/groups.cuh"
 
 struct TwistChoice {
     typedef Float32 F;

@@ -1,8 +1,10 @@
-// The float64 filter of the CPU: 8 face pairs at a time, as `float64_filter_triangles` one by one.
+// The float64 filter of the CPU: 8 face pairs at a time, as `float64_filter_triangles` one by one. It can list those
+// that are apart, too.
 #pragma once
 #include "builtin.h"
 #include "base/sizes.h"
 #include "base/float64.h"
+#include "intersect/filter_lists.h"
 
 // What the filter reads of an object pair, and its steps.
 template <class PairPose>
@@ -60,8 +62,7 @@ struct Float64Filter {
     }
     // Up to 8 straddling pairs from one on, which two more signs decide.
     __attribute__((always_inline)) void order_ends(const ids (&rotated)[6], const wp::int64* straddling, int first,
-                                                   int count, wp::int64* hits, int& met, wp::int64* rest,
-                                                   int& open) const {
+                                                   int count, FilterLists& lists) const {
         const Point p1 = F::gather(position, rotated[0] + first), q1 = F::gather(position, rotated[1] + first);
         const Point r1 = F::gather(position, rotated[2] + first), p2 = gather_posed(rotated[3] + first);
         const Point q2 = gather_posed(rotated[4] + first), r2 = gather_posed(rotated[5] + first);
@@ -72,12 +73,12 @@ struct Float64Filter {
         const Sign end = F::orient_edges(F::minus(p1, r2), p1p2, F::minus(r1, r2), F::minus(r1, p2), F::minus(r2, p2));
         const Sides s = F::filtered(start.value, BOUND_3D * start.size);
         const Sides e = F::filtered(end.value, BOUND_3D * end.size);
-        const unsigned int left = ((1u << count) - 1) & ~(s.above | e.above);
+        const unsigned int all = (1u << count) - 1, left = all & ~(s.above | e.above);
         unsigned int inexact = left & (s.open | e.open);
-        F::append(hits + met, item, left & ~inexact);
-        met += __builtin_popcount(left & ~inexact);
+        lists.keep_apart(item, all & ~left);
+        lists.keep_hits(item, left & ~inexact);
         for (; __builtin_expect(inexact != 0, 0); inexact &= inexact - 1)
-            rest[open++] = straddling[first + __builtin_ctz(inexact)];  // `append` could write over unread items
+            lists.rest[lists.open++] = straddling[first + __builtin_ctz(inexact)];  // `append` could write over unread
     }
     // From each corner of A to each of B: the other way round, every rounding is the same.
     __attribute__((always_inline)) void find_differences(const ids (&start)[6], int at, Point (&d)[3][3],
@@ -113,7 +114,8 @@ struct Float64Filter {
 
 template <class ModelPool, class StatePool, class PairPose, class Filtered>
 void simd_float64_filter(const ModelPool& models, const StatePool& states, const PairPose& pose, bool first_ends,
-                         Filtered& found, wp::array_t<wp::int64> uncertain, wp::array_t<wp::int64> faces) {
+                         bool lists_apart, Filtered& found, wp::array_t<wp::int64> uncertain,
+                         wp::array_t<wp::int64> faces, wp::array_t<wp::int64> apart) {
 #pragma clang fp contract(off)
     typedef Float64 F;
     typedef Float64Filter<PairPose> Filter;
@@ -125,9 +127,9 @@ void simd_float64_filter(const ModelPool& models, const StatePool& states, const
     typedef F::Sides Sides;
     const double* position = (const double*)models.vertex_pos.data;
     const Filter filter = {pose, position, (const double*)states.face_corner.data};
-    wp::int64* rest = uncertain.data;
-    wp::int64* hits = faces.data;
-    int met = found.met, open = 0, kept = 0;
+    const wp::int64* items = uncertain.data;
+    FilterLists lists = {faces.data, uncertain.data, lists_apart ? apart.data : nullptr, found.met, 0, found.apart};
+    int kept = 0;
     // Straddling pairs, which two more signs decide, and their corners, rotated: p, q, r of A and of B.
     typename Filter::ids rotated[6], start[6];
     wp::int64 straddling[STRADDLING_ROOM];
@@ -136,17 +138,17 @@ void simd_float64_filter(const ModelPool& models, const StatePool& states, const
         for (int i = 0; i < 6; ++i)
             *(F::loose_ints*)(rotated[i] + kept) = ints{};
         for (int i = 0; i < kept; i += 8)
-            filter.order_ends(rotated, straddling, i, kept - i < 8 ? kept - i : 8, hits, met, rest, open);
+            filter.order_ends(rotated, straddling, i, kept - i < 8 ? kept - i : 8, lists);
         kept = 0;
     };
-    const int waiting = found.uncertain, before = met, at_once = first_ends ? 8 : STRADDLING_ROOM;
+    const int waiting = found.uncertain, before = found.met, at_once = first_ends ? 8 : STRADDLING_ROOM;
     int done = 0;
-    while (done < waiting && (met == before || !first_ends)) {
+    while (done < waiting && (lists.met == before || !first_ends)) {
         const int count = waiting - done < 8 ? waiting - done : 8;
         const int at = done % at_once;
         if (at == 0)
-            filter.find_corners(rest + done, waiting - done < at_once ? waiting - done : at_once, start);
-        const bits item = *(const F::loose_longs*)(rest + done);
+            filter.find_corners(items + done, waiting - done < at_once ? waiting - done : at_once, start);
+        const bits item = *(const F::loose_longs*)(items + done);
         done += count;
         Point d[3][3], d_size[3][3];
         filter.find_differences(start, at, d, d_size);
@@ -161,17 +163,17 @@ void simd_float64_filter(const ModelPool& models, const StatePool& states, const
             side_a[i] = Sides{F::to_mask(of_a.value > bound[i]), F::to_mask(of_a.value < -bound[i]), 0};
             side_b[i] = Sides{F::to_mask(of_b.value < -bound[i + 3]), F::to_mask(of_b.value > bound[i + 3]), 0};
         }
-        unsigned int left = ((1u << count) - 1) & ~(F::one_sided(side_a) | F::one_sided(side_b));
+        const unsigned int all = (1u << count) - 1, parted = all & (F::one_sided(side_a) | F::one_sided(side_b));
+        lists.keep_apart(item, parted);
+        unsigned int left = all & ~parted;
         F::Alone alone_a = F::find_lone(side_a), alone_b = F::find_lone(side_b);
         // Else no sign that counts is open or 0.
         if (__builtin_expect((left & ~(F::has_sides(side_a) & F::has_sides(side_b))) != 0, 0)) {
             unsigned int shared;
             const unsigned int undecided = Filter::find_undecided(left, bound, d_size, side_a, side_b, shared);
             left &= ~undecided;
-            F::append(hits + met, item, shared);
-            met += __builtin_popcount(shared);
-            F::append(rest + open, item, undecided & ~shared);
-            open += __builtin_popcount(undecided & ~shared);
+            lists.keep_hits(item, shared);
+            lists.keep_open(item, undecided & ~shared);
             alone_a = F::find_alone(side_a);
             alone_b = F::find_alone(side_b);
         }
@@ -186,7 +188,8 @@ void simd_float64_filter(const ModelPool& models, const StatePool& states, const
         if (last || kept > STRADDLING_ROOM - 16)
             order_kept();
     }
-    found.met = met;
-    found.uncertain = open;
+    found.met = lists.met;
+    found.uncertain = lists.open;
+    found.apart = lists.apart;
     found.tested = done;
 }

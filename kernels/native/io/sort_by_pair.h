@@ -28,19 +28,23 @@ inline void sort_by_pair(wp::int32 count, wp::int32 pair_mask, wp::int32 flag, w
     start.data[0] = 0;
     for (int p = 0; p < pairs; ++p) {
         const int first = start.data[p], length = start.data[p + 1] - first;
-        word *from = one + first, *to = other + first, varied = 0;
-        for (int i = 1; i < length; ++i)
-            varied |= from[i] ^ from[0];
-        for (int shift = 0; shift < 64; shift += 8) {
-            if ((varied >> shift & 255) == 0)
-                continue;
-            sort_digit(from, to, length, shift);
-            word* last = from;
-            from = to;
-            to = last;
-        }
+        const word* from = sort_words(one + first, other + first, length, 0);
         for (int i = 0; i < length; ++i)
             sorted.data[first + i] = wp::vec3i(p | (from[i] & 1 ? flag : 0), (wp::int32)(from[i] >> 32),
                                                (wp::int32)((unsigned int)from[i] >> 1));
+    }
+}
+
+inline void sort_span(wp::int32 first, wp::int32 last, wp::array_t<wp::int64> key, wp::array_t<wp::int32> order) {
+    typedef unsigned long long word;
+    constexpr word LOW = 0x7fffffff;
+    word* const words = (word*)key.data + first;
+    const word high = words[0] & ~LOW;
+    for (int i = 0; i < last - first; ++i)
+        words[i] = (words[i] & LOW) << 32 | (unsigned int)order.data[first + i];
+    const word* const sorted = sort_words(words, words + key.shape[0] / 2, last - first, 32);
+    for (int i = 0; i < last - first; ++i) {
+        order.data[first + i] = (wp::int32)sorted[i];
+        words[i] = high | sorted[i] >> 32;
     }
 }

@@ -169,8 +169,12 @@ class PointStage(Stage):
         self._sort_keys(count, 31)
         inputs = [*posed[:2], start, faces, contacts, of.order, curves]
         launch(loops.average_loop_kernel, -(-count // WARP_SIZE) * WARP_SIZE, inputs, WARP_SIZE)
-        inputs = [*posed, start, faces, of.order, contacts, curves, self._slots.slots]
-        launch(manifold.offer_crossing_kernel, count, inputs)
+        if operator.uses_warps():
+            inputs = [*posed, start, faces, of.order, contacts, curves, self._slots.slots]
+            launch(manifold.offer_crossing_kernel, count, inputs)
+        else:
+            inputs = [*posed, start, faces, contacts, curves, self._slots.slots]
+            launch(manifold.offer_pair_crossing_kernel, operator.rooms.pairs, inputs)
 
     def _choose_points(self, given):
         """Choose the points of each pair. Launches only."""
@@ -189,7 +193,12 @@ class PointStage(Stage):
             operator.launch_warps(inside_points.add_inside_point_kernel, operator.rooms.pairs, inputs)
 
     def _sort_keys(self, count, bits):
-        radix_sort(self._contacts.key, self._contacts.order, count, bits)
+        """Sort contacts by their keys, of so many bits: those of pairs follow one another already. Launches only."""
+        operator, of = self.operator, self._contacts
+        if operator.uses_warps():
+            radix_sort(of.key, of.order, count, bits)
+        else:
+            operator.launch_kernel(loops.sort_loop_kernel, operator.rooms.pairs, [of.start, of.key, of.order])
 
     def read(self, found: Found, device: bool, with_rows: bool):
         """Read the points."""
