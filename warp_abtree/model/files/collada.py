@@ -5,7 +5,7 @@ import io
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
-from warp_abtree.model.files.found import MeshError, Remarks
+from warp_abtree.model.files.found import MeshError, Remarks, empty_scene
 from warp_abtree.model.files.polygons import triangulate
 
 # What tells errors of pycollada that concern no shapes.
@@ -33,7 +33,7 @@ def read_collada(data: bytes, where: str, remarks: Remarks):
     for geometry in file.geometries:
         if geometry.xmlnode is not None:
             _check_layout(geometry, where)
-    made, known, counts = trimesh.Scene(), {}, {}
+    made, known, counts = empty_scene(), {}, {}
     open_nodes = [(node, np.eye(4), None) for node in reversed(file.scene.nodes if file.scene else [])]
     while open_nodes:
         node, above, name = open_nodes.pop()

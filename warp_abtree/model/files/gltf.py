@@ -9,7 +9,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
-from warp_abtree.model.files.found import MeshError, Remarks
+from warp_abtree.model.files.found import MeshError, Remarks, empty_scene
 from warp_abtree.model.files.polygons import cut_strip
 from warp_abtree.model.files.unpack import exceeds_limit
 
@@ -78,7 +78,7 @@ class _Reader:
         """Return the meshes of the file's scene where its nodes put them."""
         import trimesh
 
-        made, nodes = trimesh.Scene(), self.tree.get("nodes", [])
+        made, nodes = empty_scene(), self.tree.get("nodes", [])
         below = {child for node in nodes for child in node.get("children", ())}
         scenes = self.tree.get("scenes", [{"nodes": [k for k in range(len(nodes)) if k not in below]}])
         shown = self.tree.get("scene", 0)
