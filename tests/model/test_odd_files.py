@@ -6,9 +6,11 @@ import zipfile
 import numpy as np
 import pytest
 import trimesh
+from helpers import refused
 from helpers.scenes import names_of, posed_triangles
 
 import warp_abtree as ab
+from warp_abtree.model.mesh import load_mesh
 
 BOX = trimesh.creation.box((1, 2, 3))
 
@@ -34,3 +36,48 @@ def test_a_node_may_be_called_as_the_frame_of_all(tmp_path, kind):
     np.testing.assert_allclose(posed_triangles(scene, 0), BOX.triangles + [5, 6, 7], atol=1e-6)
     vertices = ab.Model.load(path).mesh_at(0)[0]
     np.testing.assert_allclose([vertices.min(0), vertices.max(0)], BOX.bounds + [5, 6, 7], atol=1e-6)
+
+
+@pytest.fixture
+def dae(tmp_path):
+    """Return a function that writes a Collada file of a box, with a text of it replaced, and returns its path."""
+    pytest.importorskip("collada")
+    text = trimesh.exchange.dae.export_collada(BOX).decode()
+
+    def write(old, new):
+        assert old in text
+        (tmp_path / "a.dae").write_text(text.replace(old, new, 1))
+        return tmp_path / "a.dae"
+
+    write.geometry = re.search("<geometry[^>]* id=.([^\"']*)", text)[1]
+    return write
+
+
+def check_box(path):
+    scene = ab.scene_from_file(path, device="cpu")
+    assert scene.object_count == 1
+    np.testing.assert_allclose(posed_triangles(scene, 0), BOX.triangles)
+    assert load_mesh(path).faces.shape == (12, 3)
+
+
+def test_collada_coordinates_are_those_of_the_text(dae):
+    """In float64; what is no number is refused, and not read as 0."""
+    mesh = load_mesh(dae("-0.5", "-0.500000000001"))
+    assert mesh.vertices.min(0)[0] == -0.500000000001
+    for bad, message in (("NaN", "is not finite"), ("inf", "is not finite"), ("0,5", "cannot be read|broken")):
+        refused(ab.MeshError, message, load_mesh, dae("-0.5", bad))
+
+
+def test_what_collada_holds_beside_its_polygons_does_not_take_these_away(dae):
+    lines = '<linestrips count="1"><p>0 1 2</p></linestrips></mesh>'
+    with pytest.warns(UserWarning, match=f"a.dae: left out lines of '{dae.geometry}'$"):
+        check_box(dae("</mesh>", lines))
+    spare = '<visual_scene id="spare"><node><instance_geometry url="#{}"/></node></visual_scene>'
+    spare = spare.format(dae.geometry)
+    with pytest.warns(UserWarning, match="a.dae: left out scene 'spare'$"):
+        check_box(dae("<library_visual_scenes>", f"<library_visual_scenes>{spare}"))
+    inputs = '<input semantic="VERTEX" source="#none" offset="0"/>'
+    for tag in ("triangles", "polylist", "polygons"):
+        check_box(dae("</mesh>", f'<{tag} count="0">{inputs}</{tag}></mesh>'))
+    skew = "<skew>45 1 0 0 0 1 0</skew>"
+    refused(ab.MeshError, "a node has a <skew>", load_mesh, dae("<instance_geometry", f"{skew}<instance_geometry"))
