@@ -1,6 +1,7 @@
 """Odd but valid mesh files, against the triangles that they hold; and what is wrong with them said by its name."""
 
 import re
+import struct
 import zipfile
 
 import numpy as np
@@ -36,6 +37,64 @@ def test_a_node_may_be_called_as_the_frame_of_all(tmp_path, kind):
     np.testing.assert_allclose(posed_triangles(scene, 0), BOX.triangles + [5, 6, 7], atol=1e-6)
     vertices = ab.Model.load(path).mesh_at(0)[0]
     np.testing.assert_allclose([vertices.min(0), vertices.max(0)], BOX.bounds + [5, 6, 7], atol=1e-6)
+
+
+def stl_text(*breaks):
+    """Return a text file whose words are parted by these: after a solid's name, loop, vertices, endloop, endfacet."""
+    name, loop, vertex, end, facet = breaks
+    lines = [f"solid my vertex 2{name}"]
+    for corners in BOX.triangles.tolist():
+        points = vertex.join("vertex {} {} {}".format(*point) for point in corners)
+        lines.append(f"facet normal 0 0 1{loop}outer loop{loop}{points}{end}endloop{facet}endfacet{facet}")
+    return "".join(lines) + "endsolid"
+
+
+@pytest.mark.parametrize(
+    "breaks", ["NNNNN", "N  NN", "NNN N", "NN NN", "N   N", "N    ", "     ", "RRRRR"], ids=lambda text: repr(text)
+)
+def test_text_of_stl_is_free_of_lines(tmp_path, breaks):
+    breaks = [{"N": "\n", "R": "\r", " ": " "}[key] for key in breaks]
+    (tmp_path / "a.stl").write_text(stl_text(*breaks), newline="")
+    check_box(tmp_path / "a.stl")
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("line", ["# made in C:\\", "o C:\\", "mtllib C:\\", "usemtl a\\", "s off # \\ or \\"])
+def test_comments_and_names_of_obj_do_not_swallow_the_next_line(tmp_path, line, end):
+    vertices = ["v {} {} {}".format(*vertex) for vertex in BOX.vertices]
+    faces = [f"f {a + 1} {b + 1} \\{end} \\{end}{c + 1}" for a, b, c in BOX.faces]
+    (tmp_path / "a.obj").write_text(end.join([line, *vertices, line, *faces]), newline="")
+    check_box(tmp_path / "a.obj")
+    (tmp_path / "a.obj").write_text(end.join([line, *vertices, line, *faces, "f 1 2 x"]), newline="")
+    refused(ab.MeshError, r"a\.obj: line 47 cannot be read: f 1 2 x", load_mesh, tmp_path / "a.obj")
+
+
+@pytest.mark.parametrize("order", ["", "<", ">"])
+@pytest.mark.parametrize("first", [True, False], ids=["list first", "list last"])
+def test_vertices_of_ply_may_have_lists(tmp_path, order, first):
+    """Of several lengths, before and after their positions."""
+    name = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    columns = ["property list uchar short near", "property double x\nproperty float y\nproperty double z"]
+    head = ["ply", f"format {name} 1.0", "element vertex 8", *columns[:: 1 if first else -1], "element face 12"]
+    head += ["property list uchar int vertex_indices", "end_header", ""]
+    data = "\n".join(head).encode()
+    for k, point in enumerate(BOX.vertices.tolist()):
+        parts = [(k, *range(k)), point] if first else [point, (k, *range(k))]
+        if order:
+            data += b"".join(struct.pack(order + ("dfd" if part is point else f"B{k}h"), *part) for part in parts)
+        else:
+            data += " ".join(map(str, [*parts[0], *parts[1]])).encode() + b"\n"
+    for face in BOX.faces.tolist():
+        data += struct.pack(order + "B3i", 3, *face) if order else "3 {} {} {}\n".format(*face).encode()
+    (tmp_path / "a.ply").write_bytes(data)
+    check_box(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("kind", ["obj", "stl", "ply", "off", "glb", "gltf", "dae", "3mf", "zip"])
+def test_what_git_lfs_did_not_fetch_is_said_to_be_that(tmp_path, kind):
+    text = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'a' * 64}\nsize 12345\n"
+    (tmp_path / f"a.{kind}").write_text(text)
+    refused(ab.MeshError, "stands for a file that Git LFS has", load_mesh, tmp_path / f"a.{kind}")
 
 
 @pytest.fixture

@@ -63,6 +63,8 @@ def read_file(path: Path, remarks: Remarks):
             data = gunzip(data, str(path))
     except (OSError, EOFError, zlib.error) as error:
         raise MeshError(f"{path}: cannot be read: {first_line(error)}") from None
+    if data.startswith(b"version https://git-lfs"):
+        raise MeshError(f"{path}: stands for a file that Git LFS has, which was not fetched (git lfs pull)")
     return _read_data(data, kind, str(path), None, remarks)
 
 
