@@ -97,6 +97,20 @@ def test_what_git_lfs_did_not_fetch_is_said_to_be_that(tmp_path, kind):
     refused(ab.MeshError, "stands for a file that Git LFS has", load_mesh, tmp_path / f"a.{kind}")
 
 
+def test_archives_hold_what_is_read_and_name_the_rest(tmp_path, monkeypatch):
+    """3MF, too, where trimesh lacks the packages to read it."""
+    monkeypatch.setattr(trimesh, "available_formats", lambda: {"stl", "zip"})
+    BOX.export(tmp_path / "a.3mf")
+    for name, found in (("a.3mf", 12), ("a.usda", None)):
+        with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+            archive.writestr(name, (tmp_path / "a.3mf").read_bytes())
+        if found:
+            assert ab.Model.load(tmp_path / "a.zip").face_count == found
+        else:
+            message = r"a\.zip: holds no mesh file \(left out a\.usda\)$"
+            refused(ab.MeshError, message, ab.Model.load, tmp_path / "a.zip")
+
+
 @pytest.fixture
 def dae(tmp_path):
     """Return a function that writes a Collada file of a box, with a text of it replaced, and returns its path."""

@@ -83,7 +83,7 @@ def _read_data(data, kind, where, resolver, remarks):
         return _read_step(data, where, remarks)
     if kind in UNREAD:
         raise MeshError(f"{where}: unpack it; of archives zip and gz alone are read")
-    known = (trimesh.available_formats() | {"3mf"}) - UNREAD
+    known = _known_formats()
     if kind not in known and kind in NEEDED:
         raise MeshError(f"{where}: reading it needs {NEEDED[kind]}: pip install {NEEDED[kind]}")
     if kind not in known:
@@ -101,6 +101,13 @@ def _read_data(data, kind, where, resolver, remarks):
         raise
     except Exception as error:  # trimesh's readers raise whatever goes wrong inside them
         raise MeshError(f"{where}: cannot be read as {kind}: {first_line(error)}") from None
+
+
+def _known_formats() -> set[str]:
+    """Return the formats of trimesh that are read, and those of our own that it may lack the packages for."""
+    import trimesh
+
+    return (trimesh.available_formats() | {"3mf"}) - UNREAD
 
 
 def _read_step(data, where, remarks):
@@ -149,7 +156,7 @@ def _read_archive(members, where, remarks):
             continue
         if zipped or kind in {*USD, *UNREAD, "zip"}:
             remarks.add("left out", name)
-        elif kind in trimesh.available_formats() or kind in NEEDED or kind in STEP:
+        elif kind in _known_formats() or kind in NEEDED or kind in STEP:
             folder = name[: name.rfind("/") + 1]
             beside = {key.removeprefix(folder): other for key, other in members.items() if key.startswith(folder)}
             resolver = trimesh.resolvers.ZipResolver(beside)
@@ -160,5 +167,5 @@ def _read_archive(members, where, remarks):
                 title = trimesh.util.unique_name(node, merged.graph.nodes, counts)
                 merged.add_geometry(scene.geometry[part], title, f"{name}: {part}", transform=pose)
     if not merged.geometry:
-        raise MeshError(f"{where}: holds no mesh file")
+        raise MeshError(f"{where}: holds no mesh file" + (f" ({remarks})" if str(remarks) else ""))
     return merged
