@@ -141,6 +141,33 @@ def test_collada_coordinates_are_those_of_the_text(dae):
         refused(ab.MeshError, message, load_mesh, dae("-0.5", bad))
 
 
+TURN = trimesh.transformations.rotation_matrix(np.radians(30), [1, 2, 3])
+
+
+@pytest.mark.parametrize(
+    "texts, expected",
+    [
+        (["<translate>1234567.1 0 -0.3</translate>"], trimesh.transformations.translation_matrix([1234567.1, 0, -0.3])),
+        (["<rotate>1 2 3 30</rotate>", "<scale>0.1 0.2 -0.3</scale>"], TURN @ np.diag([0.1, 0.2, -0.3, 1])),
+        (["<rotate>0 0 0 30</rotate>", "<matrix>2 0 0 0.1 0 3 0 0 0 0 1 0 0 0 0 1</matrix>"],
+         [[2, 0, 0, 0.1], [0, 3, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+        (["<lookat>9 8 7 5 8 7 0 2 1</lookat>"], None),
+    ],
+)  # fmt: skip
+def test_transforms_of_collada_are_those_of_the_text(dae, texts, expected):
+    if expected is None:
+        back, up = np.array([1.0, 0, 0]), np.array([0, 2, 1]) / 5**0.5
+        expected = np.eye(4)
+        expected[:3, :3], expected[:3, 3] = np.stack([np.cross(up, back), up, back], 1), (9, 8, 7)
+    scene = ab.scene_from_file(dae("<instance_geometry", "".join(texts) + "<instance_geometry"), device="cpu")
+    corners = trimesh.transform_points(BOX.triangles.reshape(-1, 3), expected)
+    found = np.sort(posed_triangles(scene, 0).reshape(-1, 3), axis=0)
+    np.testing.assert_allclose(found, np.sort(corners, axis=0), rtol=1e-15, atol=1e-15 * 2e6)
+    odd = "<matrix>1 0 0 0 0 1 0 0 0 0 1 0 5 0 0 1</matrix><instance_geometry"
+    for load in (load_mesh, ab.scene_from_file):
+        refused(ab.MeshError, "its transform is not affine", load, dae("<instance_geometry", odd))
+
+
 def test_what_collada_holds_beside_its_polygons_does_not_take_these_away(dae):
     lines = '<linestrips count="1"><p>0 1 2</p></linestrips></mesh>'
     with pytest.warns(UserWarning, match=f"a.dae: left out lines of '{dae.geometry}'$"):

@@ -48,7 +48,7 @@ def read_collada(data: bytes, where: str, remarks: Remarks):
     while open_nodes:
         node, above, name = open_nodes.pop()
         if isinstance(node, collada.scene.Node):
-            pose = above @ np.asarray(node.matrix, np.float64)
+            pose = above @ _transform(node)
             # An instance of a node has none of its own.
             title = node.xmlnode.get("name") or node.xmlnode.get("id") or name or node.id
             open_nodes += [(child, pose, title) for child in reversed(node.children or [])]
@@ -60,6 +60,8 @@ def read_collada(data: bytes, where: str, remarks: Remarks):
                 known[geometry.id] = _read_geometry(geometry, where, remarks)
                 if known[geometry.id] is not None:
                     made.geometry[geometry.id] = known[geometry.id]
+            if not (above[3] == [0, 0, 0, 1]).all():
+                raise MeshError(f"{where}: node {name!r}: its transform is not affine")
             if known[geometry.id] is not None:
                 frame = trimesh.util.unique_name(name or geometry.id, made.graph.nodes, counts)
                 made.graph.update(frame, geometry=geometry.id, matrix=above)
@@ -79,6 +81,31 @@ def _without_strange_primitives(data, remarks) -> bytes:
                     continue
                 mesh.remove(primitive)
     return ElementTree.tostring(tree)
+
+
+def _transform(node) -> np.ndarray:
+    """Return the transform of a node as its text has it, which pycollada would round to float32."""
+    from trimesh.transformations import rotation_matrix, translation_matrix
+
+    pose = np.eye(4)
+    for each in getattr(node, "node", node).transforms:
+        tag, given = each.xmlnode.tag.rpartition("}")[2], np.array(each.xmlnode.text.split(), np.float64)
+        if tag == "matrix":
+            step = given.reshape(4, 4)
+        elif tag == "translate":
+            step = translation_matrix(given)
+        elif tag == "scale":
+            step = np.diag([*given, 1.0])
+        elif tag == "rotate":
+            step = rotation_matrix(np.radians(given[3]), given[:3]) if given[:3].any() else np.eye(4)
+        else:  # lookat: where a camera stands, what it sees, and up
+            eye, seen, up = given.reshape(3, 3)
+            back, side = eye - seen, np.cross(up, eye - seen)
+            axes = np.array([side, np.cross(back, side), back])
+            step = np.eye(4)
+            step[:3, :3], step[:3, 3] = (axes / np.linalg.norm(axes, axis=1, keepdims=True)).T, eye
+        pose = pose @ step
+    return pose
 
 
 def _positions(geometry, where) -> np.ndarray:
