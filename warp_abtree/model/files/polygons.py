@@ -119,12 +119,16 @@ def _is_ear(points, ring, i, j, k, after, least) -> bool:
         return True
     if not _turn(*corners) > least:
         return False
-    turns = _turn(corners[:, None], corners[[1, 2, 0], None], points)
-    if least and not (turns[:, ring[~np.isin(ring, (i, j, k))]] < -least).any(axis=0).all():
+    # Edges whose boxes are beside the triangle's do not enter it.
+    ends, margin = np.stack([points[ring], points[after[ring]]]), least**0.5
+    low, high = corners.min(axis=0) - margin, corners.max(axis=0) + margin
+    near = ((ends.max(axis=0) >= low) & (ends.min(axis=0) <= high)).all(axis=1)
+    ring, ends = ring[near], ends[:, near]
+    turns = _turn(corners[:, None], corners[[1, 2, 0], None], ends[:, None])
+    if least and not (turns[0][:, ~np.isin(ring, (i, j, k))] < -least).any(axis=0).all():
         return False
-    outside = turns <= 0.0
-    sides = _turn(points[ring, None], points[after[ring], None], corners)
-    beyond = (outside[:, ring] & outside[:, after[ring]]).any(axis=0)
+    beyond = (turns <= 0.0).all(axis=0).any(axis=0)
+    sides = _turn(ends[0, :, None], ends[1, :, None], corners)
     return bool((beyond | (sides >= 0.0).all(axis=1) | (sides <= 0.0).all(axis=1)).all())
 
 
