@@ -65,7 +65,8 @@ class _Package:
             if len(open_items) + len(names) > PLACES_MAX:
                 raise MeshError(f"{self.where}: places more than {PLACES_MAX:,} objects")
         if not self.made.geometry:
-            raise MeshError(f"{self.where}: no faces: its build places no mesh")
+            said = f" ({self.remarks})" if str(self.remarks) else ""
+            raise MeshError(f"{self.where}: no faces: its build places no mesh{said}")
         return self.made
 
     def _root(self) -> str:
