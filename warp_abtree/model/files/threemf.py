@@ -112,10 +112,12 @@ class _Package:
                     self.remarks.add("left out", f"{tag} of object {key[1]}")
         corners = [] if mesh is None else mesh.findall("{*}triangles/{*}triangle")
         if corners:
-            points = [[float(p.attrib[axis]) for axis in "xyz"] for p in mesh.iterfind("{*}vertices/{*}vertex")]
-            faces = [[int(t.attrib[corner]) for corner in ("v1", "v2", "v3")] for t in corners]
+            points = [float(p.attrib[axis]) for p in mesh.iterfind("{*}vertices/{*}vertex") for axis in "xyz"]
+            faces = [int(t.attrib[corner]) for t in corners for corner in ("v1", "v2", "v3")]
             name = trimesh.util.unique_name(found.get("name") or key[1], self.made.geometry)
-            self.made.geometry[name] = trimesh.Trimesh(np.array(points), np.array(faces), process=False)
+            self.made.geometry[name] = trimesh.Trimesh(
+                np.array(points).reshape(-1, 3), np.array(faces).reshape(-1, 3), process=False
+            )
             self._meshes[key] = name
         return self._meshes[key]
 
