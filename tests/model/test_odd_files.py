@@ -99,6 +99,7 @@ def test_what_git_lfs_did_not_fetch_is_said_to_be_that(tmp_path, kind):
 
 def test_archives_hold_what_is_read_and_name_the_rest(tmp_path, monkeypatch):
     """3MF, too, where trimesh lacks the packages to read it."""
+    pytest.importorskip("lxml"), pytest.importorskip("networkx")
     monkeypatch.setattr(trimesh, "available_formats", lambda: {"stl", "zip"})
     BOX.export(tmp_path / "a.3mf")
     for name, found in (("a.3mf", 12), ("a.usda", None)):
