@@ -98,3 +98,17 @@ def test_what_holds_nothing_says_so(device, name):
 def test_an_open_mesh_is_no_solid():
     told = describe_mesh(mesh_from_arrays(BOX.vertices, BOX.faces[1:]))
     assert told["solid"] == "no: not closed"
+
+
+def test_the_warning_points_to_the_line_that_called_the_library():
+    doubled = trimesh.util.concatenate([BOX, BOX])
+    model, scene = ab.Model.load(doubled), ab.Scene("cpu")
+    for ask in (
+        lambda: scene.add(model, solid=True),
+        lambda: scene.add_many([model, model], [(0, 0, 0, 0, 0, 0, 1)] * 2, solids=True),
+        lambda: ab.scene_from_trimesh(trimesh.Scene(doubled), device="cpu", solid=True),
+        lambda: ab.contains(model, [(0, 0, 0)], device="cpu"),
+    ):
+        with pytest.warns(RuntimeWarning, match="as a solid holds nothing") as caught:
+            ask()
+        assert {warning.filename for warning in caught} == {__file__}

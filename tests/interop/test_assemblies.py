@@ -79,6 +79,35 @@ def test_orient_and_what_the_pair_of_before_holds():
     assert volumes == pytest.approx([-6000, 6000])
 
 
+@pytest.mark.parametrize("hidden", ["over", "class", "over under the instancer"])
+def test_prototypes_may_be_hidden_from_all_but_their_instancer(tmp_path, hidden):
+    pytest.importorskip("pxr")
+    from pxr import Gf, Sdf, Usd, UsdGeom
+
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    many, place = UsdGeom.PointInstancer.Define(stage, "/many"), "/many/kept" if "under" in hidden else "/kept"
+    for name in ("plate", "spare"):
+        define_mesh(stage, f"{place}/{name}", PLATE.vertices, PLATE.faces)
+        many.GetPrototypesRel().AddTarget(f"{place}/{name}")
+    specifier = Sdf.SpecifierClass if hidden == "class" else Sdf.SpecifierOver
+    stage.GetPrimAtPath(place).SetSpecifier(specifier)
+    many.GetPrototypesRel().AddTarget("/gone")
+    many.CreateProtoIndicesAttr([1, 0, 2]), many.CreatePositionsAttr([Gf.Vec3f(x, 0, 0) for x in (9, 5, 7)])
+    stage.GetRootLayer().Save()
+    with pytest.warns(UserWarning, match="a.usda: left out what refers to /gone$"):
+        scene = ab.scene_from_file(tmp_path / "a.usda", device="cpu")
+    assert names_of(scene) == [f"/many[0]{place}/spare", f"/many[1]{place}/plate"]
+    for i, x in enumerate((9, 5)):
+        np.testing.assert_allclose(posed_triangles(scene, i), PLATE.triangles + [x, 0, 0])
+    for change, message in (
+        (lambda: many.GetProtoIndicesAttr().Set([0, 3, 1]), "/many: an instance of prototype 3, but there are 3"),
+        (lambda: many.GetPrototypesRel().SetTargets(["/a", "/b", "/c", "/many"]), "/many: it is under one of its own"),
+    ):
+        change()
+        stage.GetRootLayer().Save()
+        refused(ab.MeshError, message, ab.scene_from_file, tmp_path / "a.usda", device="cpu")
+
+
 def step_file(parts):
     """Return a STEP file (AP214, millimetres) of a faceted boundary representation for each mesh by name."""
     lines = []

@@ -146,6 +146,7 @@ def test_buffers_of_their_own(read, tmp_path):
     [
         ({"mode": 0}, "left out points of mesh 'part'"),
         ({"mode": 3}, "left out lines of mesh 'part'"),
+        ({"attributes": {"NORMAL": 2}, "mode": 4}, "left out what has no positions of mesh 'part'"),
         ({"targets": [{"POSITION": 0}]}, r"taken at rest: mesh 'part' \(morph targets\)"),
         ({"skin": 0}, r"taken at rest: crate \(skin\)"),
         ({"scenes": [{"nodes": [0]}, {"name": "spare", "nodes": [0]}]}, "left out scene 'spare'"),
@@ -179,6 +180,11 @@ def test_what_is_not_read_as_it_stands_is_named(tmp_path, change, message):
         (["bufferViews", 1], {"byteLength": 10**6}, "buffer view 1 ends outside its buffer"),
         (["buffers", 0], {"uri": "gone.bin"}, r"buffer 'gone\.bin' cannot be read"),
         (["bufferViews", 0], {"buffer": 1}, "is damaged: IndexError"),
+        (["bufferViews", 0], {"buffer": -1}, "is damaged: IndexError: -1 is below 0"),
+        (["accessors", 0], {"bufferView": -3}, "is damaged: IndexError: -3 is below 0"),
+        (["nodes", 0], {"mesh": -1}, "is damaged: IndexError: -1 is below 0"),
+        (["scenes", 0], {"nodes": [-1]}, "is damaged: IndexError: -1 is below 0"),
+        (["meshes", 0, "primitives", 0, "attributes"], {"POSITION": -3}, "is damaged: IndexError: -3 is below 0"),
         (["accessors", 1], {"componentType": 5126, "count": 9}, "mesh 'part': its indices are no integers"),
         (["nodes", 0], {"matrix": [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, "'crate': .* is not affine"),
         (["nodes", 0], {"children": [0]}, "node 0 hangs on two nodes or on itself"),
@@ -213,6 +219,19 @@ def test_compressed_and_cut_files(tmp_path):
     (tmp_path / "a.glb").write_bytes(glb(tree, blob))
     said = r"mesh 'part': KHR_draco_mesh_compression (needs DracoPy|cannot be read)"
     refused(ab.MeshError, said, ab.Model.load, tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("mode", [4, 5])
+def test_triangles_of_draco(read, mode):
+    """Lists of triangles, whatever the primitive says was packed."""
+    draco = pytest.importorskip("DracoPy")
+    data = draco.encode(POINTS.astype(float), CORNERS.reshape(-1, 3).astype(np.uint32), quantization_bits=16)
+    packed = {"KHR_draco_mesh_compression": {"bufferView": 2, "attributes": {"POSITION": 0}}}
+    tree, blob = tree_of([POINTS, CORNERS, np.frombuffer(data, np.uint8)], [SOLID | {"mode": mode}])
+    tree["meshes"][0]["primitives"][0]["extensions"] = packed
+    del tree["accessors"][0]["bufferView"]
+    found = trimesh.Trimesh(**trimesh.triangles.to_kwargs(read(tree, blob)["crate"].round(3)))
+    assert len(found.faces) == 12 and found.volume == pytest.approx(1, abs=0.01)
 
 
 def test_objects_of_obj(tmp_path):

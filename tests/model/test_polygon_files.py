@@ -17,6 +17,7 @@ from helpers.scenes import names_of
 
 import warp_abtree as ab
 from warp_abtree.model.files import unpack
+from warp_abtree.model.files.polygons import triangulate
 from warp_abtree.model.mesh import load_mesh
 
 LETTER = [(4, 1), (1, 1), (1, 3), (4, 3), (4, 4), (0, 4), (0, 0), (4, 0)]
@@ -160,6 +161,27 @@ def test_polygons_are_covered_once(tmp_path, name, shape):
         quad = triangles[[0, -2, -1]]
         assert (quad >= [50, 0, 0]).all() and (quad <= [51, 1, 0]).all(), "faces keep the order of the file"
         check_cover(triangles[1:-2], POLYGONS[shape])
+
+
+BENT = [(16, 3), (14, 10), (19, 16), (10, 18), (5, 5), (8, 4), (0, 2), (5, 1)]
+TEETH = [(2, 4), (3, 17), (4, 7), (9, 7), (8, 17), (12, 10), (18, 12), (19, 7), (13, 7), (13, 0), (10, 0), (8, 1)]
+STEPS = [(0, 0), (0, 1), (1, 1), (1, 5), (2, 5), (2, 1), (3, 1), (3, 6), (4, 6), (4, 0), (2, 0)]
+
+
+@pytest.mark.parametrize("ring", [BENT, TEETH, STEPS, LETTER, COMB, NOTCHED], ids=len)
+def test_polygons_of_any_plane_do_not_fold(ring):
+    """Corners on lines through others are beside them by rounding, either way."""
+    rng = np.random.default_rng(len(ring))
+    middles = (np.array(ring) + np.roll(ring, -1, axis=0)) / 2
+    for k in range(80):
+        flat = np.stack([ring, middles], 1).reshape(-1, 2)[:: 1 if k % 2 else 2]
+        flat = np.roll(flat, k, axis=0)[:: rng.choice([-1, 1])]
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        points = np.pad(flat, ((0, 0), (0, 1))) @ turn + rng.normal(size=3) * 9
+        corners = points[triangulate(points, np.array([len(flat)]), np.arange(len(flat)), "")]
+        x, y = (flat - flat[0]).T
+        area = abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
+        assert trimesh.triangles.area(corners).sum() == pytest.approx(area, rel=1e-9)
 
 
 def test_strips_are_wound_alike(tmp_path):

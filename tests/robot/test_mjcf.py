@@ -175,6 +175,27 @@ def test_polygons_do_not_fold(tmp_path, turned, more, scale):
     assert solid.area == pytest.approx((2 * 10 + 22) * scale**2) and solid.volume == pytest.approx(10 * scale**3)
 
 
+@pytest.mark.parametrize("kind", ["o", "g", "usemtl"])
+def test_all_objects_and_groups_of_a_file_count(tmp_path, kind):
+    """MuJoCo collides with the hull of all vertices, and shows the first object or group alone."""
+    lines, scale = [], np.array([0.5, 0.5, -0.5])
+    boxes = [trimesh.creation.box((1, 2, 3), trimesh.transformations.translation_matrix((x, 0, 0))) for x in (0, 5, 9)]
+    for k, box in enumerate(boxes):
+        lines += [f"{kind} part{k}", *("v {} {} {}".format(*vertex) for vertex in box.vertices)]
+        lines += ["f {} {} {}".format(*face) for face in box.faces + 1 + 8 * k]
+    (tmp_path / "parts.obj").write_text("\n".join(lines))
+    mesh = '<mesh name="m" file="parts.obj" scale="0.5 0.5 -0.5"/>'
+    body = '<body name="arm"><joint name="j" axis="0 0 1"/><geom type="mesh" mesh="m"/></body>'
+    robot = load(f"<mujoco><asset>{mesh}</asset><worldbody>{body}</worldbody></mujoco>", tmp_path)
+    solid = trimesh.Trimesh(*robot.models[0].mesh_at(robot.models[0].lod_max)[:2])
+    expected = trimesh.util.concatenate(boxes).apply_scale(scale)
+    assert solid.is_watertight and solid.volume == pytest.approx(3 * 6 / 8)
+    np.testing.assert_allclose(solid.bounds, expected.bounds, atol=1e-6)
+    ball = ab.Model.load(trimesh.creation.icosphere(1, 0.1))
+    poses = [(x, 0, 0.75, 0, 0, 0, 1) for x in (0, 2.5, 4.5, 1.2)]
+    assert [bool(robot.check([0.0], [(ball, pose)])) for pose in poses] == [True, True, True, False]
+
+
 GIVEN = os.environ.get("ABTREE_ROBOT")
 MENAGERIE_ARM = """<mujoco><compiler angle="radian" meshdir="assets" autolimits="true"/>
 <default><default class="arm"><joint axis="0 0 1" range="-2.8 2.8"/>

@@ -176,6 +176,17 @@ def test_formats_are_told_apart_and_a_geometry_without_meshes_is_named(urdf, mjc
         assert len(ab.Robot.load(path, "visual", device="cpu").models) == 1
 
 
+def test_names_that_are_not_in_utf_8_are_refused(tmp_path):
+    pytest.importorskip("mujoco")
+    text = '<mujoco><worldbody><body name="f\xfc\xdf"><joint/><geom size="1"/></body></worldbody></mujoco>'
+    path = tmp_path / "arm.xml"
+    path.write_text(text, encoding="utf-8")
+    assert ab.Robot.load(path, device="cpu").link_names == ("world", "f\xfc\xdf")
+    path = tmp_path / "latin.xml"
+    path.write_text(text, encoding="latin-1")
+    refused(ValueError, r"latin\.xml: a name is not in UTF-8", ab.Robot.load, path, device="cpu")
+
+
 def test_joints_that_follow_followers_and_stand_off_are_those_of_mujoco(tmp_path, device, monkeypatch):
     mujoco = pytest.importorskip("mujoco")
     text = """<mujoco><worldbody><body name="one"><joint name="a" axis="0 0 1" pos=".1 0 0" ref="20"/>

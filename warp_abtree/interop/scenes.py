@@ -60,7 +60,7 @@ def scene_from_trimesh(source, device=None, base_faces=10, progress=None, solid=
         if geometry in keys and len(source.geometry[geometry].faces):
             placed.append((node, geometry, *_split_transform(np.asarray(transform, np.float64), node)))
     if not placed:
-        raise MeshError("the trimesh.Scene holds no node with a mesh")
+        raise MeshError("there is no node with a mesh")
     scene, models = FileScene(device), dict[bytes, list]()
     names = _distinct(str(node) or "object" for node, *_ in placed)
     for name, (node, geometry, pose, stretch) in zip(names, placed):

@@ -55,10 +55,15 @@ class _StageReader:
         self.places = UsdGeom.XformCache(self.time)
         self.scene = trimesh.Scene()
         self._known: dict[tuple, str] = {}
+        self._open: list[str] = []  # instancers that are being spread
 
-    def visit(self, root, prefix, transform_of):
-        """Add what lies under a prim, nodes named with a prefix, where `transform_of` each is, a matrix of USD."""
-        geom, proxies = self.geom, self.usd.TraverseInstanceProxies()
+    def visit(self, root, prefix, transform_of, undefined=False):
+        """Add what lies under a prim, nodes named with a prefix, where `transform_of` each is, a matrix of USD.
+
+        What is `undefined`, an "over" or of a class, is visited in prototypes alone, which such prims hide elsewhere.
+        """
+        geom, usd = self.geom, self.usd
+        proxies = usd.TraverseInstanceProxies(*([usd.PrimIsActive & usd.PrimIsLoaded] if undefined else []))
         prims = iter(self.usd.PrimRange(root, proxies))
         for prim in prims:
             name = prefix + str(prim.GetPath())
@@ -113,9 +118,15 @@ class _StageReader:
 
     def _spread(self, instancer, name, base):
         """Add the instances of a point instancer that are active and visible."""
-        time, places = self.time, self.places
+        time, places, path = self.time, self.places, str(instancer.GetPath())
+        if path in self._open:
+            raise MeshError(f"{self.path}: {path}: it is under one of its own prototypes")
+        self._open.append(path)
         targets = instancer.GetPrototypesRel().GetForwardedTargets()
         indices = instancer.GetProtoIndicesAttr().Get(time) or []
+        wrong = next((index for index in indices if not 0 <= index < len(targets)), None)
+        if wrong is not None:
+            raise MeshError(f"{self.path}: {name}: an instance of prototype {wrong}, but there are {len(targets)}")
         ways = instancer.ComputeInstanceTransformsAtTime(time, time, instancer.IncludeProtoXform, instancer.IgnoreMask)
         if len(ways) != len(indices):
             raise MeshError(f"{self.path}: {name}: its {len(indices)} instances do not have a place each")
@@ -124,12 +135,17 @@ class _StageReader:
             if not shown[k]:
                 continue
             prototype = self.stage.GetPrimAtPath(targets[index])
+            if not prototype:
+                self.remarks.add("left out what refers to", str(targets[index]))
+                continue
             root = places.GetLocalToWorldTransform(prototype).GetInverse()
             self.visit(
                 prototype,
                 f"{name}[{k}]",
                 lambda prim, root=root, way=way: places.GetLocalToWorldTransform(prim) * root * way * base,
+                undefined=True,
             )
+        self._open.pop()
 
 
 def _make_shape(prim, time):

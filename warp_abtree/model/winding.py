@@ -15,14 +15,13 @@ that others close, as where bodies touch at a wall, is judged by parity on both 
 Of faces with the same three corners an even number cancels: parity counts none of them.
 """
 
-import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 
-from warp_abtree.model.files.found import MeshError
+from warp_abtree.model.files.found import MeshError, warn_caller
 from warp_abtree.model.sides import SAMPLED_FACES, holds_points, loose_inside_out, nearness, volume_sign
 
 SHOWN_EDGES = 4
@@ -133,13 +132,13 @@ def find_winding(vertices, faces, dropped_faces=()) -> Winding:
     )
 
 
-def check_solid(winding: Winding, name: str, stacklevel: int = 2):
+def check_solid(winding: Winding, name: str):
     """Raise MeshError for a mesh that has no inside, and warn of faces that hold nothing; its name stands in both."""
     if not winding.is_closed:
         raise MeshError(f"model {name!r} is no solid: it is not closed, {winding.describe_open()}")
     if len(winding.doubled):
         what = f"model {name!r} as a solid {winding.describe_solid()}; keep one of each"
-        warnings.warn(what, RuntimeWarning, stacklevel=stacklevel + 1)
+        warn_caller(what)
 
 
 def keep_outside(faces, linear):

@@ -203,5 +203,5 @@ def check_columns(models, name, world, importance, static, solid, group, mask) -
         "mask": check_numbers(mask, "collision_mask", 0, ALL_BITS, count),
     }
     for model in {id(model): model for model, solid in zip(models, columns["solid"]) if solid}.values():
-        check_solid(model.winding, model.name, stacklevel=3)
+        check_solid(model.winding, model.name)
     return columns

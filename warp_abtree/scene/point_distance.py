@@ -61,7 +61,7 @@ def signed_distance(
     """
     (model,) = check_models(model, 1)
     if flag(signed, "signed"):
-        check_solid(model.winding, model.name, stacklevel=3)
+        check_solid(model.winding, model.name)
     return_nearest, lod = flag(nearest, "nearest"), model.lod_max if lod is None else model.check_lod(lod)
     if _is_on_gpu(points):
         device = points.device if device is None else device

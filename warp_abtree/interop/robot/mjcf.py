@@ -214,9 +214,10 @@ def _shape(mujoco, model, g, where):
 
 
 def _recut(model, m, vertices, faces, where):
-    """Return the faces of a mesh, those of an OBJ file with polygons cut anew: MuJoCo's may fold over.
+    """Return the faces of a mesh, those of some OBJ files anew.
 
-    Raises RobotError where MuJoCo has other vertices than the file.
+    MuJoCo may fold polygons over, and takes the first of several objects or groups alone. Raises RobotError where it
+    has other vertices than the file.
     """
     start = int(model.mesh_pathadr[m])
     path = Path(model.paths[start : model.paths.index(b"\0", start)].decode() if start >= 0 else "")
@@ -227,7 +228,7 @@ def _recut(model, m, vertices, faces, where):
     except MeshError as error:
         raise RobotError(f"{where}: {first_line(error)}") from None
     polygons = sum(line.split(maxsplit=1)[:1] == [b"f"] for line in path.read_bytes().splitlines())
-    if not isinstance(found, FileSurface) or len(found.faces) <= polygons:
+    if not isinstance(found, FileSurface) or len(found.faces) == len(faces) <= polygons:
         return faces
     # MuJoCo scales, turns and shifts the vertices, and keeps their order.
     apart, to = math.inf, np.eye(4)[:, :3]
@@ -236,5 +237,5 @@ def _recut(model, m, vertices, faces, where):
         to = np.linalg.lstsq(given, vertices, rcond=None)[0]
         apart = np.abs(given @ to - vertices).max() / np.ptp(vertices, axis=0).max()
     if not apart <= 1e-5:
-        raise RobotError(f"{where}: {path.name} has polygons and vertices that are not MuJoCo's; make it of triangles")
+        raise RobotError(f"{where}: {path.name} has vertices that are not MuJoCo's; make it one object of triangles")
     return found.faces[:, ::-1] if np.linalg.det(to[:3]) < 0 else found.faces

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 NAMED = 4  # things that a warning lists by name
+ROOT_FRAME = "\0"  # frame that nodes hang on; one of them may be called as trimesh calls it
 
 
 class MeshError(ValueError):
@@ -19,6 +20,13 @@ def warn_caller(message: str, category: type[Warning] = RuntimeWarning):
     while frame is not None and frame.f_globals.get("__name__", "").startswith("warp_abtree."):
         frame, level = frame.f_back, level + 1
     warnings.warn(message, category, stacklevel=level)
+
+
+def empty_scene():
+    """Return a trimesh.Scene for nodes of any name."""
+    import trimesh
+
+    return trimesh.Scene(base_frame=ROOT_FRAME)
 
 
 class Remarks:
@@ -60,7 +68,7 @@ class FileSurface:
         """Return a trimesh.Scene with a node of each part that has faces, those without a name called by one."""
         import trimesh
 
-        scene, counts = trimesh.Scene(), {}
+        scene, counts = empty_scene(), {}
         for part, own in enumerate(self.names):
             faces = self.faces if self.parts is None else self.faces[self.parts == part]
             if len(faces):

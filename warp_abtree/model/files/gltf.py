@@ -9,7 +9,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
-from warp_abtree.model.files.found import MeshError, Remarks
+from warp_abtree.model.files.found import MeshError, Remarks, empty_scene
 from warp_abtree.model.files.polygons import cut_strip
 from warp_abtree.model.files.unpack import exceeds_limit
 
@@ -65,11 +65,21 @@ def _split_binary(data, where):
     return chunks[b"JSON"], chunks.get(b"BIN\0")
 
 
+class _Table(list):
+    """What the file numbers from 0."""
+
+    def __getitem__(self, index):
+        if index < 0:
+            raise IndexError(f"{index} is below 0")
+        return super().__getitem__(index)
+
+
 class _Reader:
     """One file: its tree, and the buffers that have been read."""
 
     def __init__(self, tree, binary, where, resolver, remarks):
-        self.tree, self.where, self.resolver, self.remarks = tree, where, resolver, remarks
+        self.tree = {key: _Table(value) if isinstance(value, list) else value for key, value in tree.items()}
+        self.where, self.resolver, self.remarks = where, resolver, remarks
         own = binary is not None and "uri" not in tree.get("buffers", [{}])[0]
         self._buffers = {0: binary} if own else {}
         self._meshes: dict[int, str | None] = {}
@@ -78,7 +88,7 @@ class _Reader:
         """Return the meshes of the file's scene where its nodes put them."""
         import trimesh
 
-        made, nodes = trimesh.Scene(), self.tree.get("nodes", [])
+        made, nodes = empty_scene(), self.tree.get("nodes", [])
         below = {child for node in nodes for child in node.get("children", ())}
         scenes = self.tree.get("scenes", [{"nodes": [k for k in range(len(nodes)) if k not in below]}])
         shown = self.tree.get("scene", 0)
@@ -129,6 +139,9 @@ class _Reader:
             if kind is not None:
                 self.remarks.add("left out", f"{kind} of mesh {name!r}")
                 continue
+            if "POSITION" not in primitive["attributes"]:
+                self.remarks.add("left out", f"what has no positions of mesh {name!r}")
+                continue
             if primitive.get("targets"):
                 self.remarks.add("taken at rest:", f"mesh {name!r} (morph targets)")
             points, triangles = self._triangles(primitive, name)
@@ -153,6 +166,7 @@ class _Reader:
         position = primitive["attributes"]["POSITION"]
         if packed is not None and "bufferView" not in self.tree["accessors"][position]:
             vertices, corners = self._unpack_draco(packed, where)
+            mode = 4  # whatever was packed
         else:
             vertices = self._accessor(position).astype(np.float64)
             if vertices.shape[1:] != (3,):

@@ -7,6 +7,7 @@ from warp_abtree.model.files.polygons import triangulate
 
 # How lines of plain OBJ files begin; in others, a `v` or `f` might stand behind a tab, say.
 PLAIN_STARTS = {b"", b"v ", b"f ", b"vn", b"vt", b"# ", b"#", b"o ", b"g ", b"s ", b"us", b"mt"}
+NAMES = (b"o", b"g", b"usemtl", b"mtllib")  # of objects, groups, materials and files: one may end with a backslash
 LEFT_OUT = {b"p": "points", b"l": "lines", b"curv": "curves", b"curv2": "curves", b"surf": "free-form surfaces"}
 LEFT_OUT |= {b"call": "called files", b"fo": "faces as 'fo'", b"cdc": "curves", b"cdp": "free-form surfaces"}
 LEFT_OUT |= {b"bsp": "free-form surfaces", b"bzp": "free-form surfaces"}
@@ -58,13 +59,22 @@ def _find_parts(begun: list, triangle_counts) -> tuple:
     return (None, *names), np.repeat(parts, triangle_counts)
 
 
+def _join_lines(lines: list) -> list:
+    """Append to lines that end with a backslash the next ones, which become empty; comments and names do not go on."""
+    for k in range(len(lines) - 1, 0, -1):
+        before = lines[k - 1].rstrip()
+        if before.endswith(b"\\") and b"#" not in before and before.split()[0] not in NAMES:
+            lines[k - 1 : k + 1] = before[:-1] + b" " + lines[k], b""
+    return lines
+
+
 def read_obj(data: bytes, where: str, remarks: Remarks) -> FileSurface:
     """Return what an OBJ file holds; raise MeshError with the line that cannot be read."""
     plain = _parse_plain_obj(data)
     if plain is not None:
         return plain
     vertices, corners, counts, begun = [], [], [], []
-    for number, line in enumerate(data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines(), start=1):
+    for number, line in enumerate(_join_lines(data.splitlines()) if b"\\" in data else data.splitlines(), start=1):
         fields = line.split()
         kind = fields[0] if fields else b""
         if kind != b"v" and kind != b"f":

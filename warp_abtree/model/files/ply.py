@@ -77,7 +77,7 @@ def _strips(counts, corners):
     ends = np.cumsum(counts)
     for start, end in zip(ends - counts, ends):
         part = corners[start:end]
-        yield from (piece[piece >= 0] for piece in np.split(part, np.flatnonzero(part == -1)))
+        yield from (piece[piece != -1] for piece in np.split(part, np.flatnonzero(part == -1)))
 
 
 def _read_header(data, where):
@@ -166,22 +166,22 @@ def _read_binary(data, order, element, where):
     same = _read_alike(data, kinds, element.count)
     if same is not None:
         return same
-    starts: dict[str, list] = {name: [] for name, (length, _) in kinds.items() if length}
+    starts: dict[str, list] = {name: [] for name, (length, _) in kinds.items() if length or element.is_needed(name)}
     lengths: dict[str, list] = {name: [] for name in starts}
     steps = [(name, length and np.dtype(length), np.dtype(kind).itemsize) for name, (length, kind) in kinds.items()]
     at, last = 0, len(data)
     byte_order: Literal["big", "little"] = "big" if order == ">" else "little"
     for row in range(element.count):
         for name, length, size in steps:
-            if length is None:
-                at += size
-                continue
-            there = int.from_bytes(data[at : at + length.itemsize], byte_order, signed=length.kind == "i")
-            if there < 0:
-                raise MeshError(f"{where}: {element.name} {row} has {there} corners")
-            at += length.itemsize
-            starts[name].append(at)
-            lengths[name].append(there)
+            there = 1
+            if length is not None:
+                there = int.from_bytes(data[at : at + length.itemsize], byte_order, signed=length.kind == "i")
+                if there < 0:
+                    raise MeshError(f"{where}: {element.name} {row} has {there} corners")
+                at += length.itemsize
+            if name in starts:
+                starts[name].append(at)
+                lengths[name].append(there)
             at += there * size
         if at > last:
             raise _cut_short(where, element, row)
@@ -191,7 +191,7 @@ def _read_binary(data, order, element, where):
         first = np.repeat(np.array(starts[name]) - kind.itemsize * (np.cumsum(counts) - counts), counts)
         place = first + kind.itemsize * np.arange(len(first))
         values = raw[place[:, None] + np.arange(kind.itemsize)].reshape(-1).view(kind)
-        columns[name] = counts, values
+        columns[name] = (counts, values) if kinds[name][0] else values
     return data[at:], columns
 
 

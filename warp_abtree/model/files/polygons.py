@@ -64,19 +64,35 @@ def distinct_corners(faces):
 def _clip_ears(points):
     """Cut a counterclockwise polygon whose fan folds into triangles that do not; return their corners.
 
-    Corners may repeat, and edges touch, as where cuts join a polygon's holes to its outline.
+    Corners may repeat, and edges touch, as where cuts join a polygon's holes to its outline. Cuts through corners that
+    lie on them within rounding may leave what crosses itself: there, cuts with none near them go first.
     """
-    count = len(points)
-    if count == 4:
+    if len(points) == 4:
         return [(3, 0, 1), (1, 2, 3)]  # the fan from corner 0 folds
+    found = []
+    for least in (0.0, 2.0**-40 * np.ptp(points, axis=0).max() ** 2):
+        triangles = _cut_ears(points, least)
+        areas = _turn(*points[np.array(triangles)].transpose(1, 0, 2))
+        found.append((np.abs(areas).sum(), triangles))
+        if found[-1][0] <= (1 + 1e-9) * areas.sum():
+            break
+    return min(found, key=lambda each: each[0])[1]
+
+
+def _cut_ears(points, least):
+    """Cut ears off a polygon, as long as there are any those of more area than the least, with no corner so near."""
+    count = len(points)
     before, after = np.roll(np.arange(count), 1), np.roll(np.arange(count), -1)
     left, triangles = np.ones(count, bool), []
     queue, all_asked = deque(range(count)), True
     while len(triangles) < count - 2:
         if queue:
             j = queue.popleft()
-            if not left[j] or not _is_ear(points, np.flatnonzero(left), before[j], j, after[j], after):
+            if not left[j] or not _is_ear(points, np.flatnonzero(left), before[j], j, after[j], after, least):
                 continue
+        elif least:
+            queue, least = deque(np.flatnonzero(left)), 0.0
+            continue
         else:
             # No ear: corners without area first, which may free others; what crosses itself is cut anyhow.
             ring = np.flatnonzero(left)
@@ -93,16 +109,26 @@ def _clip_ears(points):
     return triangles
 
 
-def _is_ear(points, ring, i, j, k, after) -> bool:
-    """Return whether a triangle at corner j turns left, or is a point that repeats, and no edge enters it."""
+def _is_ear(points, ring, i, j, k, after, least) -> bool:
+    """Return whether a triangle at corner j turns left, or is a point that repeats, and no edge enters it.
+
+    With a least area it has more than that, and each other corner of the ring makes more with an edge, outside of it.
+    """
     corners = points[[i, j, k]]
     if (corners[1] == corners[::2]).all(axis=1).any():
         return True
-    if not _turn(*corners) > 0.0:
+    if not _turn(*corners) > least:
         return False
-    outside = _turn(corners[:, None], corners[[1, 2, 0], None], points) <= 0.0
-    sides = _turn(points[ring, None], points[after[ring], None], corners)
-    beyond = (outside[:, ring] & outside[:, after[ring]]).any(axis=0)
+    # Edges whose boxes are beside the triangle's do not enter it.
+    ends, margin = np.stack([points[ring], points[after[ring]]]), least**0.5
+    low, high = corners.min(axis=0) - margin, corners.max(axis=0) + margin
+    near = ((ends.max(axis=0) >= low) & (ends.min(axis=0) <= high)).all(axis=1)
+    ring, ends = ring[near], ends[:, near]
+    turns = _turn(corners[:, None], corners[[1, 2, 0], None], ends[:, None])
+    if least and not (turns[0][:, ~np.isin(ring, (i, j, k))] < -least).any(axis=0).all():
+        return False
+    beyond = (turns <= 0.0).all(axis=0).any(axis=0)
+    sides = _turn(ends[0, :, None], ends[1, :, None], corners)
     return bool((beyond | (sides >= 0.0).all(axis=1) | (sides <= 0.0).all(axis=1)).all())
 
 

@@ -4,7 +4,6 @@ import codecs
 import contextlib
 import io
 import os
-import re
 import sys
 import warnings
 import zlib
@@ -14,20 +13,20 @@ import numpy as np
 
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.model.files.collada import read_collada
-from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
+from warp_abtree.model.files.found import FileSurface, MeshError, Remarks, empty_scene
 from warp_abtree.model.files.gltf import read_gltf
 from warp_abtree.model.files.obj import read_obj
 from warp_abtree.model.files.off import read_off
 from warp_abtree.model.files.ply import read_ply
 from warp_abtree.model.files.stl import read_stl
+from warp_abtree.model.files.threemf import read_3mf
 from warp_abtree.model.files.unpack import gunzip, unzip
 
 SURFACES = {"obj": read_obj, "ply": read_ply, "off": read_off, "stl": read_stl, "stl_ascii": read_stl}
 USD = ("usd", "usda", "usdc", "usdz")
 STEP = ("step", "stp")
 # Of trimesh, or of ours: packages that some formats need.
-NEEDED = {"dae": "pycollada", "zae": "pycollada", "xaml": "lxml"}
-NEEDED |= {"3mf": "lxml networkx", "3dxml": "lxml networkx"}
+NEEDED = {"dae": "pycollada", "zae": "pycollada", "xaml": "lxml", "3dxml": "lxml networkx"}
 MILLIMETRES = 1000.0  # in a metre, the unit of glTF
 UNREAD = {"tar.gz", "tar.bz2", "bz2"}  # archives that trimesh would read past the limit, and past our readers
 
@@ -64,6 +63,8 @@ def read_file(path: Path, remarks: Remarks):
             data = gunzip(data, str(path))
     except (OSError, EOFError, zlib.error) as error:
         raise MeshError(f"{path}: cannot be read: {first_line(error)}") from None
+    if data.startswith(b"version https://git-lfs"):
+        raise MeshError(f"{path}: stands for a file that Git LFS has, which was not fetched (git lfs pull)")
     return _read_data(data, kind, str(path), None, remarks)
 
 
@@ -82,7 +83,7 @@ def _read_data(data, kind, where, resolver, remarks):
         return _read_step(data, where, remarks)
     if kind in UNREAD:
         raise MeshError(f"{where}: unpack it; of archives zip and gz alone are read")
-    known = trimesh.available_formats() - UNREAD
+    known = _known_formats()
     if kind not in known and kind in NEEDED:
         raise MeshError(f"{where}: reading it needs {NEEDED[kind]}: pip install {NEEDED[kind]}")
     if kind not in known:
@@ -90,8 +91,8 @@ def _read_data(data, kind, where, resolver, remarks):
     try:
         if kind in ("zip", "zae"):
             return _read_archive(unzip(data, where), where, remarks)
-        if kind in ("3mf", "3dxml"):
-            _check_extensions(unzip(data, where), where)
+        if kind == "3mf":
+            return read_3mf(unzip(data, where), where, remarks)
         with warnings.catch_warnings():
             # Older NumPy only warns where a number in a text file cannot be read, and cuts the file short there.
             warnings.filterwarnings("error", message="string or file could not be read")
@@ -100,6 +101,13 @@ def _read_data(data, kind, where, resolver, remarks):
         raise
     except Exception as error:  # trimesh's readers raise whatever goes wrong inside them
         raise MeshError(f"{where}: cannot be read as {kind}: {first_line(error)}") from None
+
+
+def _known_formats() -> set[str]:
+    """Return the formats of trimesh that are read, and those of our own that it may lack the packages for."""
+    import trimesh
+
+    return (trimesh.available_formats() | {"3mf"}) - UNREAD
 
 
 def _read_step(data, where, remarks):
@@ -137,31 +145,18 @@ def _stdout_to_stderr():
         os.close(kept)
 
 
-def _check_extensions(members, where):
-    """Refuse a 3MF file that requires an extension which trimesh passes over, such as beam lattices."""
-    for name, data in members.items():
-        root = re.search(rb"<(\w+:)?model\b[^>]*>", data) if name.lower().endswith(".model") else None
-        text = root[0] if root else b""
-        required = re.search(rb"""requiredextensions\s*=\s*["']([^"']*)""", text)
-        for prefix in required[1].split() if required else ():
-            space = re.search(rb"xmlns:" + re.escape(prefix) + rb"""\s*=\s*["']([^"']*)""", text)
-            title = (space[1] if space else prefix).decode(errors="replace")
-            if not any(known in title for known in ("/production/", "/material/")):
-                raise MeshError(f"{where}: requires the 3MF extension {title}, which is not read")
-
-
 def _read_archive(members, where, remarks):
     """Return the mesh files of a zip archive in one scene, but for hidden ones, such as macOS adds to each file."""
     import trimesh
 
-    merged, counts = trimesh.Scene(), {}
+    merged, counts = empty_scene(), {}
     for name, data in members.items():
         stem, kind, zipped = split_file_name(Path(name))
         if Path(name).name.startswith("."):
             continue
         if zipped or kind in {*USD, *UNREAD, "zip"}:
             remarks.add("left out", name)
-        elif kind in trimesh.available_formats() or kind in NEEDED or kind in STEP:
+        elif kind in _known_formats() or kind in NEEDED or kind in STEP:
             folder = name[: name.rfind("/") + 1]
             beside = {key.removeprefix(folder): other for key, other in members.items() if key.startswith(folder)}
             resolver = trimesh.resolvers.ZipResolver(beside)
@@ -172,5 +167,5 @@ def _read_archive(members, where, remarks):
                 title = trimesh.util.unique_name(node, merged.graph.nodes, counts)
                 merged.add_geometry(scene.geometry[part], title, f"{name}: {part}", transform=pose)
     if not merged.geometry:
-        raise MeshError(f"{where}: holds no mesh file")
+        raise MeshError(f"{where}: holds no mesh file" + (f" ({remarks})" if str(remarks) else ""))
     return merged

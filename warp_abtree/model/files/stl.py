@@ -1,11 +1,17 @@
 """STL files, binary and text; of one whose length is wrong, the facets that are there."""
 
+import re
+
 import numpy as np
 
 from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
 
 FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 STL_HEADER = 84  # bytes of text and count
+# Blanks before words that begin a line in most text files.
+BREAKS = re.compile(
+    rb"\s+(?=(?:facet\s+normal|outer\s+loop|endloop|endfacet|endsolid)\b|vertex(?:\s+[-+.\d]\S*){3})", re.IGNORECASE
+)
 
 
 def read_stl(data: bytes, where: str, remarks: Remarks) -> FileSurface:
@@ -40,7 +46,10 @@ def _read_text(data, where, remarks):
     names: list[str | None] = []
     parts: list[int] = []
     done, number, ended = 0, 0, False
-    lines = data.splitlines()
+    lines, lower = data.splitlines(), data.lower()
+    begun = sum(line.lstrip()[:6].lower() in (b"vertex", b"endloo") for line in lines)
+    if begun < lower.count(b"vertex") + lower.count(b"endloop"):
+        lines = BREAKS.sub(b"\n", data).splitlines()
     for number, line in enumerate(lines, start=1):
         words = line.split(maxsplit=4)
         match words[0].lower() if words else b"":
