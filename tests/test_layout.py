@@ -1,12 +1,23 @@
 """The floor plan: which package may import which, and how files are laid out; and that each rule catches its breaks."""
 
 import ast
+import gc
 import re
 import sys
 
 import layout_rules as rules
 import pytest
 from layout_rules import FILES, KERNELS, NATIVE, PACKAGE, ROOT, TESTS, USERS, imports, package_of, parse
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_collection():
+    """Keep the collector from the syntax trees of all files, which are held as long as this module's tests run."""
+    gc.disable()
+    yield
+    gc.enable()
+    parse.cache_clear()
+    rules.walk.cache_clear()
 
 
 def shown(path):
