@@ -206,16 +206,6 @@ p 1
 """
 
 
-@pytest.mark.parametrize("extension", ["obj", "obj.gz"])
-@pytest.mark.parametrize("faces", ["f 1 2 3\nf 1 3 4\n", "f 1 2 3 4\n"])
-def test_a_byte_order_mark_costs_no_vertex(tmp_path, extension, faces):
-    """Windows editors write one, plain files and others."""
-    data = b"\xef\xbb\xbf" + f"v 0 0 7\nv 1 0 0\nv 1 1 0\nv 0 1 0\n{faces}".encode()
-    (tmp_path / f"square.{extension}").write_bytes(gzip.compress(data) if extension.endswith(".gz") else data)
-    mesh = load_mesh(tmp_path / f"square.{extension}")
-    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]] and mesh.vertices[0].tolist() == [0, 0, 7]
-
-
 def test_obj_keeps_the_order_of_the_file(tmp_path):
     path = tmp_path / "order.obj"
     path.write_text(OBJ)

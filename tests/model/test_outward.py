@@ -104,11 +104,8 @@ def test_no_point_is_farther(model, share):
 
 EXACT = {
     "flat grid": lambda: turned(*grid(2), seed=1),
-    "line": lambda: line((1.0, 2.0, -1.0), 9),
     "turned line": lambda: line(np.random.default_rng(9).normal(size=3), 6),
     "box": lambda: turned(*of_trimesh(trimesh.creation.box())),
-    "comb": lambda: turned(*square_comb(2)),
-    "soup": lambda: soup(12, 5),
     "lattice soup": lambda: soup(20, 6, lattice=3),
     "far away": lambda: (turned(*grid(2))[0] + 1e6 * np.random.default_rng(0).normal(size=3), grid(2)[1]),
 }
@@ -137,7 +134,7 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("name", [*SHAPES, *slow("cow", "fandisk", "rocker-arm", "stanford-bunny")])
+@pytest.mark.parametrize("name", [*SHAPES, *slow("cow", "fandisk")])
 def test_it_is_tight(name):
     known = name in SHAPES
     model = ab.Model.from_arrays(*SHAPES[name](), base_faces=4) if known else ab.Model.load(real_mesh_path(name))
