@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 import time
-import urllib.request
 import warnings
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 from conftest import slow_rows
 from helpers.samples import SHUTTLE_SCENE
 from helpers.viewer import run_command, write_scene
@@ -44,7 +44,7 @@ def hang(file=None, *_, **__):
     if hasattr(file, "write"):
         file.write(b"half" if "b" in file.mode else "half")
         file.flush()
-    print("{}", flush=True)
+    print("here", flush=True)
     for _ in range(600):  # a signal just before a sleep does not end it: its handler runs after it
         time.sleep(0.1)
 
@@ -52,9 +52,7 @@ PLACE = hang
 sys.exit(cli.main())
 """
 BUILD = "build ball.obj new.npz"
-QUERY = "query ball.obj ball.obj --output faces --record new.npz"
 SWEEP = "sweep ball.npz ball.npz poses.npy --out answers --ray none"
-VIEW = "view ball.obj ball.obj --port 0 --json"
 
 
 def ignore():
@@ -82,13 +80,8 @@ def files(tmp_path, monkeypatch):
     [
         (BUILD, "np.savez_compressed", ignore, INTERRUPT, 130, []),
         *slow_rows(
-            (BUILD, "np.savez_compressed", block, TERMINATE, 143, []),
-            ("run scene.toml --record new.csv", "ab.Frame.run", None, TERMINATE, 143, []),
-            ("run scene.toml --record new.json", "ab.Frame.run", ignore, INTERRUPT, 130, []),
-            (QUERY, "np.savez", block, INTERRUPT, 130, []),
+            ("run scene.toml --record new.csv", "ab.Frame.run", block, TERMINATE, 143, []),
             (SWEEP, "np.savez", ignore, TERMINATE, 143, ["answers", "answers/job.json"]),
-            (VIEW, "_", ignore, INTERRUPT, 0, []),  # an interrupt is how people end it
-            (VIEW, "_", block, TERMINATE, 143, []),
         ),
     ],
 )
@@ -104,26 +97,20 @@ def test_a_signal_stops_a_command(files, words, place, before, number, status, l
         **pipes,
     ) as process:
         try:
-            first = process.stdout.readline()
-            assert first, process.stderr.read()
-            found = json.loads(first)
-            if found:
-                assert found["objects"] == 2 and found["title"] == "ball"
-                with urllib.request.urlopen(found["address"], timeout=20) as answer:
-                    assert answer.status == 200 and b"<html" in answer.read(2000)
+            assert process.stdout.readline(), process.stderr.read()
             process.send_signal(number)
             shown, errors = process.communicate(timeout=30)
         finally:
             process.kill()
-    told = {0: [], 130: ["warp-abtree: interrupted"], 143: ["warp-abtree: terminated"]}[status]
+    told = {130: ["warp-abtree: interrupted"], 143: ["warp-abtree: terminated"]}[status]
     assert [line for line in errors.splitlines() if "compiling kernels" not in line] == told
     assert (process.returncode, shown) == (status, "")
     assert sorted(str(path.relative_to(files)) for path in set(files.rglob("*")) - known) == left
     assert all(path.read_text() == "old" for path in files.glob("new.*"))
 
 
-def run_process(words, code="import runpy; runpy.run_module('warp_abtree', run_name='__main__')", **variables):
-    """Run a command in a process of its own; return its status and what it says."""
+def run_process(words, code, **variables):
+    """Run code with arguments in a process of its own; return its status and what it says."""
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, "-c", code, *words.split()],
@@ -135,28 +122,16 @@ def run_process(words, code="import runpy; runpy.run_module('warp_abtree', run_n
     return done.returncode, done.stdout, done.stderr
 
 
-STOP_IN_FRAME = """
-import os, signal, sys
-import warp_abtree as ab
-from warp_abtree.app.cli import main as cli
+@pytest.mark.parametrize("name", ["rows.csv", "rows.json"])
+def test_an_interrupted_run_keeps_its_rows(files, capsys, monkeypatch, name):
+    def stop(frame, advance=ab.Frame._advance):
+        if len(frame.history) == 3:
+            raise KeyboardInterrupt
+        advance(frame)
 
-advance = ab.Frame._advance
-
-def stop(frame):
-    if len(frame.history) == 3:
-        os.kill(os.getpid(), signal.SIGINT)
-    advance(frame)
-
-ab.Frame._advance = stop
-sys.exit(cli.main())
-"""
-
-
-@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize("name", ["rows.csv", *slow_rows(["rows.json"])])
-def test_an_interrupted_run_keeps_its_rows(files, name):
-    status, _, errors = run_process(f"run scene.toml --record {name} --device cpu", STOP_IN_FRAME)
-    assert (status, errors) == (130, "warp-abtree: interrupted\n")
+    monkeypatch.setattr(ab.Frame, "_advance", stop)
+    words = f"run scene.toml --record {name} --device cpu".split()
+    assert run_command(capsys, *words, status=130)[1] == ["warp-abtree: interrupted"]
     text = Path(name).read_text()
     rows = json.loads(text) if name.endswith("json") else list(csv.DictReader(io.StringIO(text)))
     assert [int(row["frame"]) for row in rows] == [0, 1, 2]
@@ -184,21 +159,13 @@ sys.exit(main())
 """
 
 
-def test_the_version_needs_no_warp():
-    told = run_process("--version", STOP_AT, STOP_AT="warp", NUMBER=str(INTERRUPT.value), DELAY="0.01")
-    assert told == (0, f"warp-abtree {ab.__version__}\n", "")
-
-
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize(
     ("module", "number", "delay", "told"),
     [
-        ("warp", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
         ("pxr", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),  # of a command that runs already
         *slow_rows(
-            ("scipy.sparse", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
             ("trimesh", TERMINATE, 0.01, (143, "warp-abtree: terminated\n")),
-            ("trimesh.exchange.gltf", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
             ("pxr", TERMINATE, 60.0, (143, "warp-abtree: terminated\n")),  # and that ends before it comes again
         ),
     ],
@@ -254,59 +221,27 @@ class Thing:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-def test_a_signal_after_the_last_code_changes_nothing():
-    told = run_process("--version", THING + "sys.kept = Thing()\nsys.exit(main())")
-    assert told == (0, f"warp-abtree {ab.__version__}\n", "")
-
-
-# A signal comes while a finaliser runs, of which Python drops what is raised, or at the end of the process.
-STOP_IN_DEL = (
-    THING
-    + """
-from warp_abtree.app.cli import model_commands
-
-def describe(mesh, described=model_commands.describe_mesh):
-    thing = Thing()
-    del thing
-    import time
-    for _ in range(300):
-        time.sleep(0.1)
-
-def print_last(*result, print_result=model_commands.print_result):
-    print_result(*result)
-    atexit.register(os.kill, os.getpid(), 2)
-
-PLACE
-sys.exit(main())
-"""
-)
-
-
-@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize(
-    ("place", "told"),
+    ("last", "status", "errors"),
     [
-        ("model_commands.print_result = print_last", (130, True, "warp-abtree: interrupted\n")),
-        *slow_rows(("model_commands.describe_mesh = describe", (130, False, "warp-abtree: interrupted\n"))),
+        ("sys.kept = Thing()", 0, ""),  # after the last code a signal changes nothing
+        ("atexit.register(os.kill, os.getpid(), 2)", 130, "warp-abtree: interrupted\n"),
     ],
 )
-def test_a_signal_while_something_ends_is_not_dropped(files, place, told):
-    status, shown, errors = run_process("info ball.obj --device cpu", STOP_IN_DEL.replace("PLACE", place))
-    assert (status, "diagonal" in shown, errors) == told
+def test_the_version_needs_no_warp_and_ends_as_a_signal_says(last, status, errors):
+    code = f"{THING}\nsys.modules['warp'] = None\nstatus = main()\n{last}\nsys.exit(status)"
+    assert run_process("--version", code) == (status, f"warp-abtree {ab.__version__}\n", errors)
 
 
-@pytest.mark.slow
-def test_a_warning_is_one_line(files):
-    Path("lines.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nl 1 2\n")
-    status, _, errors = run_process("info lines.obj --device cpu")
-    assert (status, errors) == (0, "warp-abtree: lines.obj: left out lines\n")
-
-
-def test_a_kernel_cache_that_cannot_be_written_names_its_variable(files, capsys):
-    status, _, errors = run_process("info ball.obj --device cpu", WARP_CACHE_PATH=str(files / "ball.obj" / "cache"))
-    assert status == 2 and errors.count("\n") == 1 and "ball.obj/cache" in errors
-    assert errors.endswith("(Warp's kernel cache; WARP_CACHE_PATH names a folder that can be written)\n")
-    _, (error,) = run_command(capsys, "info", "gone.obj", "--device", "cpu", status=2)
+def test_a_kernel_cache_that_cannot_be_written_names_its_variable(files, capsys, monkeypatch):
+    words, cache = ("info", "ball.obj", "--device", "cpu"), files / "ball.obj" / "cache"
+    with monkeypatch.context() as patch:
+        patch.setattr(wp.config, "kernel_cache_dir", str(cache))
+        patch.setattr(cli, "start_warp", lambda: os.makedirs(cache))
+        _, (error,) = run_command(capsys, *words, status=2)
+    assert "ball.obj/cache" in error
+    assert error.endswith(" (Warp's kernel cache; WARP_CACHE_PATH names a folder that can be written)")
+    _, (error,) = run_command(capsys, "info", "gone.obj", *words[2:], status=2)
     assert "WARP_CACHE_PATH" not in error
 
 

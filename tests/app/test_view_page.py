@@ -1,6 +1,7 @@
 """The viewer's page on its server, without a browser and in a headless Chromium (playwright, extra dev)."""
 
 import io
+import json
 import re
 import socket
 import threading
@@ -21,6 +22,7 @@ pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 from websockets import Headers
 
 from warp_abtree.app import view
+from warp_abtree.app.cli.main import Terminated
 from warp_abtree.app.playback import StillPlayback
 from warp_abtree.app.viewer import page as module
 from warp_abtree.app.viewer.command import serve
@@ -114,7 +116,9 @@ def test_the_server_refuses_websockets_and_files(server):
             lines = [f"{key}: {value}" for key, value in [*fill(headers, server.get_port()), *more.items()]]
             with socket.create_connection(("127.0.0.1", server.get_port()), timeout=20) as asked:
                 asked.sendall("\r\n".join(["GET / HTTP/1.1", *lines, "", ""]).encode())
-                assert int(asked.recv(100).split()[1]) == (403 if marks[0] == "x" else status), (headers, more)
+                told = asked.recv(100_000)
+                assert int(told.split()[1]) == (403 if marks[0] == "x" else status), (headers, more)
+                assert status == 101 or marks[0] == "x" or b"text/html" in told
 
 
 def test_a_server_that_does_not_ask_is_not_used():
@@ -326,6 +330,18 @@ def test_a_port_that_is_taken(tmp_path, capsys):
         port = other.getsockname()[1]
         _, errors = run_command(capsys, "view", write_scene(tmp_path), "--port", port, status=2)
     assert f"127.0.0.1:{port}: cannot be served at (Address already in use)" in errors[0]
+
+
+@pytest.mark.parametrize(("stop", "status"), [(KeyboardInterrupt(), 0), (Terminated(143), 143)])
+def test_an_interrupt_is_how_people_end_it(tmp_path, capsys, monkeypatch, stop, status):
+    def run(page, seconds):
+        raise stop
+
+    monkeypatch.setattr(Page, "run", run)
+    shown, errors = run_command(capsys, "view", write_scene(tmp_path), "--port", 0, "--json", status=status)
+    found = json.loads(shown)
+    assert (found["objects"], found["title"]) == (4, "scene") and found["address"].startswith("http://localhost:")
+    assert errors == ([] if status == 0 else ["warp-abtree: terminated"])
 
 
 def count_green(tab) -> int:
