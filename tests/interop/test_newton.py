@@ -165,18 +165,6 @@ def test_shapes_that_are_no_meshes_are_newtons(device):
     np.testing.assert_allclose(poses[:, 2], [0.5, 1.5, 0.3], atol=0.01)
 
 
-@pytest.mark.slow
-def test_a_ring_falls_over_a_peg_in_newton(device):
-    builder = newton.ModelBuilder()
-    peg, ring = trimesh.creation.cylinder(0.3, 1.2, sections=8), trimesh.creation.torus(0.8, 0.25, 16, 8)
-    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=newton_mesh(FLOOR))
-    builder.add_shape_mesh(-1, xform=at(z=0.55), mesh=newton_mesh(peg))
-    builder.add_shape_mesh(builder.add_body(xform=at(0.1, 0, 1.0, (2, 1, 0), 0.15)), mesh=newton_mesh(ring))
-    model = builder.finalize(device=device)
-    x, y, z = settle(model, ab.NewtonContacts(model), 400)[0][0, :3]
-    assert np.hypot(x, y) < 0.3 and z == pytest.approx(0.25, abs=0.02)
-
-
 GROUND = trimesh.creation.box((4, 4, 1))
 # A wedge with a step, like none of its mirror images.
 PART = trimesh.Trimesh(
@@ -224,22 +212,6 @@ def test_mirrored_shapes_are_those_mirrored_by_hand(device, on_body, solids):
         # From the floor to what stands on it, also where that is in the floor.
         up = found[2][:, 2] * np.where(found[0] == 0, 1, -1)
         assert (up > 0.5).all(), scale
-
-
-@pytest.mark.slow
-def test_mirrored_shapes_rest_where_newton_has_them(device):
-    """A mirrored ball on a mirrored floor, beside Newton's own contacts."""
-    ball = trimesh.creation.icosphere(1, radius=0.3)
-    low = float(ball.vertices[:, 2].min())
-    builder = newton.ModelBuilder()
-    floor = newton_mesh(GROUND)
-    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=floor, scale=wp.vec3(1.0, -1.0, 1.0), cfg=CLOSE)
-    body = builder.add_body(xform=at(z=-low))
-    builder.add_shape_mesh(body, mesh=newton_mesh(ball), scale=wp.vec3(-1.0, -1.0, -1.0), cfg=CLOSE)
-    model = builder.finalize(device=device)
-    finders = ab.NewtonContacts(model), newton.CollisionPipeline(model)
-    ours, newtons = (settle(model, found, 40, iterations=10)[0] for found in finders)
-    assert ours[0, 2] == pytest.approx(newtons[0, 2], abs=0.003) == pytest.approx(-low, abs=0.003)
 
 
 def stack(device):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from helpers.bodies import PairContacts, at, collided, contact_rows, newton_mesh, settle, touching_shapes
+from helpers.bodies import PairContacts, at, collided, contact_rows, newton_mesh, touching_shapes
 
 import warp_abtree as ab
 
@@ -62,23 +62,6 @@ def test_other_pairs_of_one_plane_are_as_many_as_bodies():
     found = ab.NewtonContacts(builder.finalize(device="cpu"))
     found.contacts(100)
     assert found.others.shape_pairs_filtered.numpy().tolist() == [[0, k] for k in range(1, 301)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mu, slides", [(0.2, True), (0.8, False)])
-def test_friction_is_that_of_the_shapes(device, mu, slides):
-    """A cube on a slope of 0.4 rad, whose tangent is 0.42."""
-    slope = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), 0.4)
-    config = newton.ModelBuilder.ShapeConfig(gap=0.01, mu=mu)
-    builder = newton.ModelBuilder()
-    below, above = (wp.transform(wp.quat_rotate(slope, wp.vec3(0, 0, z)), slope) for z in (-0.5, 0.5))
-    builder.add_shape_mesh(-1, xform=below, mesh=FLOOR, cfg=config)
-    builder.add_shape_mesh(builder.add_body(xform=above), mesh=CUBE, cfg=config)
-    model = builder.finalize(device=device)
-    poses, _ = settle(model, ab.NewtonContacts(model), 120, iterations=8)
-    way = np.linalg.norm((poses - model.state().body_q.numpy())[0, :3])
-    # By friction alone it would slide 9.81 (sin - mu cos) t^2 / 2 = 0.25 m.
-    assert 0.15 < way < 0.35 if slides else way < 0.03
 
 
 @pytest.mark.slow  # Newton compiles much for it
@@ -210,11 +193,9 @@ def test_hammered_nuts_stay_on_their_threads(scene, device, tolerance):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", ["xpbd", "mujoco"])
-def test_nuts_follow_the_pitch(scene, device, solver):
-    if solver == "mujoco":
-        pytest.importorskip("mujoco_warp")
-    nuts = make_nuts(scene, solver, device, 1)
+def test_nuts_follow_the_pitch(scene, device):
+    pytest.importorskip("mujoco_warp")
+    nuts = make_nuts(scene, "mujoco", device, 1)
     nuts.run(1.5)
     assert (nuts.turned < -1).all()
     np.testing.assert_allclose(nuts.travel(), 1, atol=0.05)
