@@ -107,17 +107,12 @@ def test_keys_of_scene_files_are_listed_as_they_are():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_links_lead_somewhere(page):
-    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
-    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+def test_links_and_names_lead_somewhere(page):
+    """`warp_abtree/scenes` and kernels stand there in what is installed."""
+    text = page.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"```.*?```", "", text, flags=re.S)):
         if not target.startswith(("http", "#")):
             assert (page.parent / target.split("#")[0]).exists(), target
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_files_that_are_named_exist(page):
-    """Of the checkout; `warp_abtree/scenes` and kernels stand there in what is installed."""
-    text = page.read_text(encoding="utf-8")
     for name in re.findall(r"`((?:bench|docs|kernels|scenes|tests|warp_abtree)/[\w./]+)`", text):
         assert (ROOT / name).exists() or name in ("warp_abtree/kernels", "warp_abtree/scenes"), name
 
@@ -141,13 +136,6 @@ def test_bounds_are_numbered_once_and_cited():
     assert cited == set(numbered)
 
 
-def test_blocks_are_found_and_told_apart():
-    found = BLOCK.findall("x\n<!-- needs: torch, cuda -->\n```python\na\n```\n\n```sh\nb\n```\n```python\nc\n```\n")
-    assert found == [("torch, cuda", "python", "a\n"), ("", "sh", "b\n"), ("", "python", "c\n")]
-    assert missing(["no_such_module", "numpy"]) == ["no_such_module"]
-    assert len(PYTHON) > 15 and [page for page, _ in PYTHON].count(ROOT / "README.md") == 1
-
-
 def commands_of(page):
     """Yield the words of every `warp-abtree` command in the shell blocks of a page, without its name."""
     for _, text in blocks_of(page, "sh"):
@@ -156,20 +144,14 @@ def commands_of(page):
                 yield line.split("warp-abtree ", 1)[1].split("#")[0].split()
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if any(commands_of(page))], ids=name_of)
-def test_commands_parse(page):
-    for words in commands_of(page):
-        assert cli.make_parser().parse_args(words).command == words[0]
-        for word in words:
-            assert not word.startswith("scenes/") or (ROOT / word).is_file()
-
-
 # Commands that are not run here, and why.
 NOT_RUN = {"view": "serves until it is stopped; tests/app/test_view_page.py", "bench": "a study; tests/bench"}
 
 
 def run_words(words):
     """Run a command of a page at small cost, on the CPU; return why it was not run, or None."""
+    assert cli.make_parser().parse_args(words).command == words[0]
+    assert all((ROOT / word).is_file() for word in words if word.startswith("scenes/"))
     if words[0] in NOT_RUN:
         return NOT_RUN[words[0]]
     devices = words[words.index("--device") + 1].split(",") if "--device" in words else ["cpu"]

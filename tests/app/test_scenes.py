@@ -229,20 +229,6 @@ def test_rigid_bodies_of_a_file(tmp_path, device):
     assert [row.hits for row in loaded.frame(controller="none").run(4)] == hits, "a run begins at the start"
 
 
-@pytest.mark.slow
-def test_rain(device):
-    loaded = load_ours("rain", device, [("cells = [128, 128]", "cells = [16, 16]")], objects=30)
-    assert 29 <= loaded.scene.object_count <= 31 and loaded.frames >= 300
-    frame = loaded.frame(budget_ms=12, clock=WorkClock(RATES))
-    frame.run(90)
-    late = frame.history[60:]
-    assert min(row.intersecting for row in late) > 5 and frame.history[0].intersecting < 5
-    assert frame.summary()["budget"]["within_110_percent"] >= 0.95
-    assert all(row.answer_ms >= 0 and row.error_mean > 0 for row in late)
-    height = frame.motion.dynamics.poses()[1:, 1]
-    assert height.min() > -0.6 and np.median(height) < 2.5
-
-
 def test_hammered_nuts_stay_on_their_thread(device):
     """The rings arrive in the third step; where a nut is off the thread's helix it has passed through."""
     loaded = load_ours("nut_and_bolt", device, [("worlds = 8", "worlds = 1")])

@@ -70,15 +70,6 @@ def test_legend_tells_models_or_lods(playback):
     assert by_lod == ["coarsest LOD", "finest LOD", plain[1], plain[3]]
 
 
-def test_bounds_hold_all_that_is_shown(playback):
-    snapshot = playback.query("count")
-    centre, radius = geometry.bounds(geometry.MeshCache(playback.scene), snapshot, np.arange(3))
-    for i in range(3):
-        vertices = playback.scene.models[playback.scene.object_model[i]].mesh_at(int(snapshot.lods[i]))[0]
-        assert np.linalg.norm(posed(vertices, snapshot.poses[i]) - centre, axis=1).max() <= radius * (1 + 1e-9)
-    assert radius < 6
-
-
 def test_a_panel_holds_what_the_title_counts(playback):
     cache, snapshot = geometry.MeshCache(playback.scene), playback.query("faces")
     settings = Settings()

@@ -54,16 +54,6 @@ def test_pairs_are_those_of_newton(device):
     assert ours | others == expected
 
 
-def test_other_pairs_of_one_plane_are_as_many_as_bodies():
-    builder = newton.ModelBuilder()
-    builder.add_ground_plane()
-    for _ in range(300):
-        builder.add_shape_mesh(builder.add_body(), mesh=CUBE)
-    found = ab.NewtonContacts(builder.finalize(device="cpu"))
-    found.contacts(100)
-    assert found.others.shape_pairs_filtered.numpy().tolist() == [[0, k] for k in range(1, 301)]
-
-
 @pytest.mark.slow  # Newton compiles much for it
 def test_particles_are_newtons(device):
     builder = newton.ModelBuilder()
