@@ -271,6 +271,13 @@ def test_a_file_of_parts_is_said_to_be_joined(assemblies, capsys, monkeypatch):
 
 def test_a_file_of_parts_is_a_scene(assemblies, capsys, device):
     for name, parts in assemblies.items():
+        Path("scene.toml").write_text(f'[models.m]\nmesh = "{name}"\n[[objects]]\nmodel = "m"\n')
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            ab_app.load_scene("scene.toml", device=device)
+        told = [str(each.message) for each in caught if "joined" in str(each.message)]
+        start = f"scene.toml: models.m: the {parts} parts of {name} are joined into one mesh; scene_from_file"
+        assert len(told) == (parts > 1) and all(each.startswith(start) for each in told)
         playback = open_playback([name], device)
         assert playback.title == Path(name).stem and playback.scene.object_count == parts
         if parts == 1:
@@ -286,17 +293,6 @@ def test_a_file_of_parts_is_a_scene(assemblies, capsys, device):
         assert "--lod: for meshes" in run(capsys, "picture", "three.glb", "--lod", 1, "--out", "a.png", status=2)[1][0]
     told = run(capsys, "run", "three.glb", "--objects", 9, status=2)[1][0]
     assert "three.glb: objects: are those of the file" in told
-
-
-def test_a_scene_file_of_parts_warns(assemblies):
-    for name, parts in assemblies.items():
-        Path("scene.toml").write_text(f'[models.m]\nmesh = "{name}"\n[[objects]]\nmodel = "m"\n')
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            ab_app.load_scene("scene.toml", device="cpu")
-        told = [str(each.message) for each in caught if "joined" in str(each.message)]
-        start = f"scene.toml: models.m: the {parts} parts of {name} are joined into one mesh; scene_from_file"
-        assert len(told) == (parts > 1) and all(each.startswith(start) for each in told)
 
 
 def test_lost_work_is_status_1(files, capsys, monkeypatch):

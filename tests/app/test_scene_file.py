@@ -29,6 +29,12 @@ def test_smallest_scene(tmp_path):
     assert loaded.scene.lods.tolist() == [loaded.models["ball"].lod_max]
     assert np.array_equal(loaded.motion.poses(3.0), [[0, 0, 0, 0, 0, 0, 1]])
     assert loaded.frame().step().any.tolist() == []
+    path = tmp_path / "scene.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + ONE.replace("\n", "\r\n").encode())  # as Windows writes
+    assert load_scene(path, device="cpu").scene.object_count == 1
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
+    for path, message in ((tmp_path / "gone.toml", ""), (tmp_path, ""), (tmp_path / "bytes.toml", ": not valid TOML")):
+        refused(SceneError, f"{path}{message}", load_scene, path, device="cpu")
 
 
 def test_every_key_of_an_object(tmp_path):
@@ -259,12 +265,6 @@ def test_numbers_that_overflow_are_told_in_one_line(tmp_path, text):
     refused(SceneError, None, load, tmp_path, text)
 
 
-def test_file_that_is_none(tmp_path):
-    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
-    for path, message in ((tmp_path / "gone.toml", ""), (tmp_path, ""), (tmp_path / "bytes.toml", ": not valid TOML")):
-        refused(SceneError, f"{path}{message}", load_scene, path, device="cpu")
-
-
 def deep(count, value="1"):
     return ".".join(["a"] * count) + f" = {value}\n"
 
@@ -312,12 +312,6 @@ def test_dots_of_strings_and_comments_are_no_keys(tmp_path, monkeypatch, title):
     monkeypatch.setattr(decode, "TABLE_LIMIT", 6)  # [models.ball], [[objects]] and what stands below
     key = "title" if "1.5" not in title else "time_step"
     load(tmp_path, ONE + f"velocity = [1.5, 2.5, 3.5]\n[scene]\n{key} = {title.format(40 * 'a.[')}\nseed = 3\n")
-
-
-def test_a_byte_order_mark_is_left_out(tmp_path):
-    path = tmp_path / "scene.toml"
-    path.write_bytes(b"\xef\xbb\xbf" + ONE.replace("\n", "\r\n").encode())
-    assert load_scene(path, device="cpu").scene.object_count == 1
 
 
 @pytest.mark.parametrize("case", LIMITS)

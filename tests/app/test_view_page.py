@@ -101,12 +101,6 @@ def test_pages_of_others_are_refused(headers, marks):
     assert is_refused(request, "localhost") is is_refused(request, "::1") is (marks[0] == "x")
 
 
-def test_what_is_said_twice_is_refused():
-    headers = [("Host", "localhost:1"), ("Origin", "http://localhost:1")]
-    for again in headers:
-        assert is_refused(SimpleNamespace(headers=Headers([*headers, again])), "127.0.0.1")
-
-
 def test_the_server_refuses_websockets_and_files(server):
     """Answers of HTTP to what `ASKED` sends, as of browsers, over a plain socket."""
     upgrade = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
@@ -119,6 +113,9 @@ def test_the_server_refuses_websockets_and_files(server):
                 told = asked.recv(100_000)
                 assert int(told.split()[1]) == (403 if marks[0] == "x" else status), (headers, more)
                 assert status == 101 or marks[0] == "x" or b"text/html" in told
+    headers = [("Host", "localhost:1"), ("Origin", "http://localhost:1")]
+    for again in headers:
+        assert is_refused(SimpleNamespace(headers=Headers([*headers, again])), "127.0.0.1"), "said twice"
 
 
 def test_a_server_that_does_not_ask_is_not_used():
