@@ -182,25 +182,6 @@ def test_usd_shapes_are_read_as_meshes(tmp_path, kind):
         assert inside.min() > -1e-5 and curved.max(initial=0) < 0.002 * values.get("radius", 0) + 1e-5
 
 
-def test_usd_planes(tmp_path):
-    pytest.importorskip("pxr")
-    from pxr import Usd, UsdGeom
-
-    stage = Usd.Stage.CreateNew(str(tmp_path / "planes.usda"))
-    sizes = {"X": (0, 3, 2), "Y": (2, 0, 3), "Z": (2, 3, 0)}
-    for axis in sizes:
-        plane = UsdGeom.Plane.Define(stage, f"/{axis}")
-        plane.GetAxisAttr().Set(axis), plane.GetWidthAttr().Set(2.0), plane.GetLengthAttr().Set(3.0)
-    stage.GetRootLayer().Save()
-    scene = ab.scene_from_file(tmp_path / "planes.usda", device="cpu")
-    names = names_of(scene)
-    for i, name in enumerate(names):
-        found = posed_triangles(scene, i)
-        assert np.ptp(found.reshape(-1, 3), axis=0).tolist() == list(sizes[name[1]]) and len(found) == 2
-        assert np.allclose(trimesh.triangles.normals(found)[0], np.eye(3)["XYZ".index(name[1])])
-        assert trimesh.triangles.area(found).sum() == pytest.approx(6.0)
-
-
 def test_what_usd_hides_is_left_out_and_named(tmp_path):
     """Invisible prims with all under them, hidden and inactive instances, and geometry of other kinds."""
     pytest.importorskip("pxr")
@@ -283,16 +264,25 @@ def test_usd_purposes_and_what_is_not_carried_out(tmp_path):
     assert "not subdivided: /smooth (catmullClark)" in said and "taken at rest: /skinned (skin or blend" in said
 
 
-def test_usd_polygons_do_not_fold(tmp_path):
+def test_usd_polygons_do_not_fold_and_planes_have_an_axis(tmp_path):
     pytest.importorskip("pxr")
-    from pxr import Usd
+    from pxr import Usd, UsdGeom
 
     letter = [(4, 1), (1, 1), (1, 3), (4, 3), (4, 4), (0, 4), (0, 0), (4, 0)]
-    stage = Usd.Stage.CreateNew(str(tmp_path / "letter.usda"))
-    define_mesh(stage, "/letter", np.insert(letter, 2, 0, 1), [range(8)])
+    stage = Usd.Stage.CreateNew(str(tmp_path / "flat.usda"))
+    define_mesh(stage, "/L", np.insert(letter, 2, 0, 1), [range(8)])
+    sizes = {"X": (0, 3, 2), "Y": (2, 0, 3), "Z": (2, 3, 0)}
+    for axis in sizes:
+        plane = UsdGeom.Plane.Define(stage, f"/{axis}")
+        plane.GetAxisAttr().Set(axis), plane.GetWidthAttr().Set(2.0), plane.GetLengthAttr().Set(3.0)
     stage.GetRootLayer().Save()
-    scene = ab.scene_from_file(tmp_path / "letter.usda", device="cpu")
-    assert trimesh.triangles.area(posed_triangles(scene, 0)).sum() == pytest.approx(10)
+    scene = ab.scene_from_file(tmp_path / "flat.usda", device="cpu")
+    found = {name[1]: posed_triangles(scene, i) for i, name in enumerate(names_of(scene))}
+    assert trimesh.triangles.area(found.pop("L")).sum() == pytest.approx(10)
+    for axis, triangles in found.items():
+        assert np.ptp(triangles.reshape(-1, 3), axis=0).tolist() == list(sizes[axis]) and len(triangles) == 2
+        assert np.allclose(trimesh.triangles.normals(triangles)[0], np.eye(3)["XYZ".index(axis)])
+        assert trimesh.triangles.area(triangles).sum() == pytest.approx(6.0)
 
 
 def red_faces(mesh):
