@@ -228,36 +228,6 @@ def test_polygons_that_are_not_convex_do_not_fold(tmp_path, turned, flip):
         assert np.linalg.norm(cross.sum(axis=0)) / 2 == pytest.approx(outline)
 
 
-def test_trimesh_and_scene():
-    shape = ball()
-    mesh = load_mesh(shape, name="ball")
-    np.testing.assert_array_equal(mesh.vertices, shape.vertices)
-    np.testing.assert_array_equal(mesh.faces, shape.faces)
-    assert mesh.name == "ball"
-    scene = trimesh.Scene()
-    scene.add_geometry(shape, node_name="here")
-    mirror = np.array([[0, -1, 0, 4], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], float)
-    scene.add_geometry(shape, node_name="there", transform=mirror)
-    scene.add_geometry(trimesh.PointCloud([[9.0, 9.0, 9.0]]))
-    joined = load_mesh(scene)
-    count = len(shape.faces)
-    np.testing.assert_array_equal(joined.vertices[joined.faces[:count]], shape.vertices[shape.faces])
-    mirrored = shape.vertices[shape.faces][:, ::-1][..., [1, 2, 0]] * [-1, 1, 1] + [4, 0, 0]
-    np.testing.assert_array_equal(joined.vertices[joined.faces[count:]], mirrored)
-    assert describe_mesh(joined)["components"] == 2
-
-
-@pytest.mark.parametrize("name, faces", [("bunny", 12200), ("bear", 3968), ("rocks", 10870)])
-def test_warp_meshes(name, faces):
-    pytest.importorskip("pxr")
-    mesh = load_mesh(f"warp:{name}")
-    report = describe_mesh(mesh)
-    assert (report["name"], report["faces"], report["closed"]) == (name, faces, True)
-    # Closed and without folds: the areas of the two sides of every axis cancel.
-    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
-    assert np.abs(np.cross(b - a, c - a).sum(axis=0)).max() < 1e-9 * report["diagonal"] ** 2
-
-
 CORNER_LINES = b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
 

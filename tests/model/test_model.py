@@ -237,27 +237,6 @@ def test_types_shapes_and_values_are_checked(tmp_path, parts):
         refused(ab.ModelError, rf"m\.npz: {said}", Model.open, path)
 
 
-def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "m.npz"
-    model, other = with_errors(sample("three")), with_errors(sample("twins"))
-    model.save(path)
-    before = path.read_bytes()
-
-    def fail(file, **arrays):
-        file.write(b"half")
-        raise OSError("disk full")
-
-    monkeypatch.setattr(np, "savez_compressed", fail)
-    for target in (path, tmp_path / "new.npz"):
-        refused(OSError, "disk full", other.save, target)
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["m.npz"]
-    monkeypatch.undo()
-    other.save(path)
-    assert_same(other, Model.open(path))
-    refused(OSError, None, model.save, tmp_path / "absent" / "m.npz")
-
-
 def test_lods_and_requests_of_lods_are_checked():
     model = sample("twins")
     for lod in (-1, 10**6, 0.5, True, "1"):

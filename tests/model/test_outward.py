@@ -51,20 +51,6 @@ def some_lods(model, count=6):
     return sorted({*np.geomspace(1, m + 1, count).astype(int) - 1, *np.linspace(0, m, count).astype(int)})
 
 
-BOX = trimesh.creation.box().subdivide().subdivide().subdivide()
-
-
-def test_flat_regions_cost_nothing():
-    """A LOD within the original surface, or within rounding of it, has a bound of that size; edges do not spoil it."""
-    for name in ("one", "ball", "soup", "lattice soup", "twins"):
-        model = sample(name)
-        assert model.error_at(model.lod_max, side="outward") == 0.0
-    for shape in (grid(12), turned(*grid(12)), of_trimesh(BOX), turned(*of_trimesh(BOX))):
-        model = ab.Model.from_arrays(*shape)
-        size = np.ptp(original(model), axis=(0, 1)).max()
-        assert model.error_at(model.lod_for(fraction=0.1), side="outward") < 1e-8 * size
-
-
 @st.composite
 def models(draw):
     """Soups with repeated and degenerate faces, crumbs, flat grids and balls, out of shape and far from the origin."""

@@ -271,8 +271,12 @@ def test_error_is_tight(name, limit, real_mesh_path):
 
 def test_flat_regions_cost_nothing():
     for name, count in (("box", 12), ("flat grid", 2)):
-        progressive = build_progressive(mesh_from_arrays(*MESHES[name]()), base_faces=count)
-        assert progressive.lod_error[progressive.lod_for(fraction=count / progressive.face_count)] < 1e-6, name
+        mesh = mesh_from_arrays(*MESHES[name]())
+        progressive, size = build_progressive(mesh, base_faces=count), np.ptp(mesh.vertices, axis=0).max()
+        lod = progressive.lod_for(fraction=count / progressive.face_count)
+        assert progressive.lod_error[lod] < 1e-6, name
+        outward = OutwardError(progressive, active_build(progressive.vertex_pos, progressive.face_vertex))
+        assert outward.at(lod) < 1e-8 * size and outward.at(progressive.lod_max) == 0, name
 
 
 @pytest.mark.parametrize("name", ["cow", "fandisk", "fcl-env", "homer"])
