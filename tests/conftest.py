@@ -1,5 +1,6 @@
 """Fixtures of all tests: the devices present, and the folder of real meshes."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -17,6 +18,11 @@ wp.config.log_level = wp.LOG_WARNING
 wp.init()
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def pytest_collection_finish():
+    """Keep what was imported, which stays, out of the collections that tests and the interpreter make."""
+    gc.freeze()
 
 
 def slow_rows(*rows):

@@ -112,10 +112,12 @@ def test_wheel_runs_without_the_checkout(wheel, tmp_path):
         env = {**os.environ, "PYTHONPATH": str(tmp_path / "installed")}
         return subprocess.run([sys.executable, *words], env=env, **options)
 
-    folder = python("-c", "from warp_abtree.app.toml.folder import *; print(scene_folder(), *scene_names())").stdout
+    code = "import runpy\nfrom warp_abtree.app.toml.folder import *\nprint(scene_folder(), *scene_names())\n"
+    code += "runpy.run_module('warp_abtree', run_name='__main__')"
+    done = python("-c", code, *"run needle --frames 1 --device cpu --json".split())
+    folder, found = done.stdout.split("\n", 1)
     assert folder.split() == [str(tmp_path / "installed" / "warp_abtree" / "scenes"), *scene_names()]
-    done = python(*"-m warp_abtree run needle --frames 1 --device cpu --json".split())
-    assert done.returncode == 0 and json.loads(done.stdout)["frames"] == 1, done.stderr
+    assert done.returncode == 0 and json.loads(found)["frames"] == 1, done.stderr
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from helpers import refused
 from helpers.questions import in_a_row
-from helpers.samples import SHAPES, SHUTTLE_SCENE, STILL, sample
+from helpers.samples import SHUTTLE_SCENE, STILL, sample
 from helpers.viewer import write_scene
 
 import warp_abtree as ab
@@ -100,7 +100,7 @@ REFUSED = [
     *refuse("^solid .*'closed'", lambda x: ab.scene_from_trimesh(trimesh.Scene(), solid=x), *NO_FLAG, None),
     *refuse("friction", lambda x: ab.Dynamics(balls(count=1), friction=x), np.inf),
     *refuse(
-        "base_faces", lambda x: ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], base_faces=x), 1.5, np.inf, "ten", True
+        "base_faces", lambda x: ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], base_faces=x), 0, 1.5, np.inf, "ten", True
     ),
 ]
 
@@ -158,34 +158,3 @@ def test_info_reads_a_built_model(tmp_path, capsys):
     assert found["m.npz"] == {key: value for key, value in found["m.obj"].items() if key not in of_file} | own
     assert main(["info", str(tmp_path / "m.npz"), "--device", "cpu"]) == 0
     assert re.search(r"^lods +\d", capsys.readouterr().out, re.M)
-
-
-# Model files with one array changed: arrays that fit in type, length and range, but are not one mesh's,
-INCONSISTENT = {
-    "scaled up": ("vertex_pos", lambda x: x * 2.0**150),
-    "all roots": ("vertex_parent", lambda x: np.full_like(x, -1)),
-    "faces reversed": ("face_vertex", lambda x: x[::-1]),
-    "splits reversed": ("face_split", lambda x: x[::-1]),
-    "another slice": ("split_face", lambda x: np.roll(x, 1)),
-    "slices at the end": ("split_start", lambda x: np.where(np.arange(len(x)) > 0, x[-1], 0)),
-}
-# and arrays that would make a mesh, but not the one saved.
-ALTERED = {
-    "half the size": ("vertex_pos", lambda x: x * 0.5),
-    "half the error": ("lod_error", lambda x: x * 0.5),
-    "leaves swapped": ("leaf_node", lambda x: np.concatenate([x[1::-1], x[2:]])),
-    "another name": ("name", lambda _: np.array("boll")),
-}
-
-
-@pytest.mark.parametrize("case", [*INCONSISTENT, *ALTERED])
-def test_model_files_that_were_altered_are_refused(tmp_path, case):
-    path = tmp_path / "m.npz"
-    ab.Model.from_arrays(*SHAPES["small ball"](), base_faces=4, name="ball").save(path)
-    ab.Model.open(path)
-    name, change = {**INCONSISTENT, **ALTERED}[case]
-    with np.load(path) as file:
-        arrays = dict(file)
-    arrays[name] = change(arrays[name])
-    np.savez(path, **arrays)
-    refused(ab.ModelError, r"m\.npz: " + ("altered since it was saved" if case in ALTERED else ""), ab.Model.open, path)

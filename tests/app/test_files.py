@@ -21,7 +21,6 @@ from warp_abtree.checks import atomic_write as files
 from warp_abtree.checks.atomic_write import SUFFIX, atomic_write, sweep_up
 from warp_abtree.jobs import SweepJob, ThisProcess, run_shards
 
-SIZE = 200_000
 MODEL = ab.Model.from_arrays(np.eye(3), [[0, 1, 2]])
 
 
@@ -42,38 +41,6 @@ def end(processes):
     for process in processes:
         process.kill()
         process.communicate()
-
-
-WRITER = f"""
-path, letter = sys.argv[1], sys.argv[2].encode()
-print("ready", flush=True)
-sys.stdin.readline()
-for _ in range(50):
-    with atomic_write(path) as file:
-        for _ in range(4):
-            file.write(letter * {SIZE // 4})
-            file.flush()
-"""
-
-
-def test_processes_that_write_one_path_never_tear_it(tmp_path):
-    path = tmp_path / "model.npz"
-    path.write_bytes(b"0" * SIZE)
-    writers = [start(WRITER, path, letter) for letter in "abcd"]
-    try:
-        assert [writer.stdout.readline() for writer in writers] == ["ready\n"] * 4
-        for writer in writers:
-            writer.stdin.write("\n")
-            writer.stdin.flush()
-        seen = set()
-        while any(writer.poll() is None for writer in writers):
-            found = path.read_bytes()
-            assert len(found) == SIZE and len(set(found)) == 1, "a torn file"
-            seen.add(found[:1])
-        assert [writer.wait() for writer in writers] == [0] * 4
-    finally:
-        end(writers)
-    assert len(seen) > 1 and [entry.name for entry in tmp_path.iterdir()] == ["model.npz"]
 
 
 @pytest.fixture

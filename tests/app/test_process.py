@@ -1,4 +1,4 @@
-"""The process of a command: errors on stderr, and SIGINT and SIGTERM, which leave no half-written file."""
+"""The process of a command: errors and progress on stderr, and signals, which leave no half-written file."""
 
 import csv
 import io
@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 import time
-import urllib.request
 import warnings
 from functools import partial
 from pathlib import Path
@@ -19,12 +18,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 from conftest import slow_rows
 from helpers.samples import SHUTTLE_SCENE
 from helpers.viewer import run_command, write_scene
 
 import warp_abtree as ab
 from warp_abtree.app.cli import main as cli
+from warp_abtree.app.cli import progress as progress_module
 from warp_abtree.checks import signals
 from warp_abtree.jobs import RayPool
 from warp_abtree.jobs import ray_pool as cluster
@@ -39,12 +40,13 @@ import sys, time
 import numpy as np
 import warp_abtree as ab
 from warp_abtree.app.cli import main as cli
+from warp_abtree.app.cli import progress as progress_module
 
 def hang(file=None, *_, **__):
     if hasattr(file, "write"):
         file.write(b"half" if "b" in file.mode else "half")
         file.flush()
-    print("{}", flush=True)
+    print("here", flush=True)
     for _ in range(600):  # a signal just before a sleep does not end it: its handler runs after it
         time.sleep(0.1)
 
@@ -52,9 +54,7 @@ PLACE = hang
 sys.exit(cli.main())
 """
 BUILD = "build ball.obj new.npz"
-QUERY = "query ball.obj ball.obj --output faces --record new.npz"
 SWEEP = "sweep ball.npz ball.npz poses.npy --out answers --ray none"
-VIEW = "view ball.obj ball.obj --port 0 --json"
 
 
 def ignore():
@@ -82,13 +82,8 @@ def files(tmp_path, monkeypatch):
     [
         (BUILD, "np.savez_compressed", ignore, INTERRUPT, 130, []),
         *slow_rows(
-            (BUILD, "np.savez_compressed", block, TERMINATE, 143, []),
-            ("run scene.toml --record new.csv", "ab.Frame.run", None, TERMINATE, 143, []),
-            ("run scene.toml --record new.json", "ab.Frame.run", ignore, INTERRUPT, 130, []),
-            (QUERY, "np.savez", block, INTERRUPT, 130, []),
+            ("run scene.toml --record new.csv", "ab.Frame.run", block, TERMINATE, 143, []),
             (SWEEP, "np.savez", ignore, TERMINATE, 143, ["answers", "answers/job.json"]),
-            (VIEW, "_", ignore, INTERRUPT, 0, []),  # an interrupt is how people end it
-            (VIEW, "_", block, TERMINATE, 143, []),
         ),
     ],
 )
@@ -104,26 +99,20 @@ def test_a_signal_stops_a_command(files, words, place, before, number, status, l
         **pipes,
     ) as process:
         try:
-            first = process.stdout.readline()
-            assert first, process.stderr.read()
-            found = json.loads(first)
-            if found:
-                assert found["objects"] == 2 and found["title"] == "ball"
-                with urllib.request.urlopen(found["address"], timeout=20) as answer:
-                    assert answer.status == 200 and b"<html" in answer.read(2000)
+            assert process.stdout.readline(), process.stderr.read()
             process.send_signal(number)
             shown, errors = process.communicate(timeout=30)
         finally:
             process.kill()
-    told = {0: [], 130: ["warp-abtree: interrupted"], 143: ["warp-abtree: terminated"]}[status]
+    told = {130: ["warp-abtree: interrupted"], 143: ["warp-abtree: terminated"]}[status]
     assert [line for line in errors.splitlines() if "compiling kernels" not in line] == told
     assert (process.returncode, shown) == (status, "")
     assert sorted(str(path.relative_to(files)) for path in set(files.rglob("*")) - known) == left
     assert all(path.read_text() == "old" for path in files.glob("new.*"))
 
 
-def run_process(words, code="import runpy; runpy.run_module('warp_abtree', run_name='__main__')", **variables):
-    """Run a command in a process of its own; return its status and what it says."""
+def run_process(words, code, **variables):
+    """Run code with arguments in a process of its own; return its status and what it says."""
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, "-c", code, *words.split()],
@@ -135,28 +124,16 @@ def run_process(words, code="import runpy; runpy.run_module('warp_abtree', run_n
     return done.returncode, done.stdout, done.stderr
 
 
-STOP_IN_FRAME = """
-import os, signal, sys
-import warp_abtree as ab
-from warp_abtree.app.cli import main as cli
+@pytest.mark.parametrize("name", ["rows.csv", "rows.json"])
+def test_an_interrupted_run_keeps_its_rows(files, capsys, monkeypatch, name):
+    def stop(frame, advance=ab.Frame._advance):
+        if len(frame.history) == 3:
+            raise KeyboardInterrupt
+        advance(frame)
 
-advance = ab.Frame._advance
-
-def stop(frame):
-    if len(frame.history) == 3:
-        os.kill(os.getpid(), signal.SIGINT)
-    advance(frame)
-
-ab.Frame._advance = stop
-sys.exit(cli.main())
-"""
-
-
-@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize("name", ["rows.csv", *slow_rows(["rows.json"])])
-def test_an_interrupted_run_keeps_its_rows(files, name):
-    status, _, errors = run_process(f"run scene.toml --record {name} --device cpu", STOP_IN_FRAME)
-    assert (status, errors) == (130, "warp-abtree: interrupted\n")
+    monkeypatch.setattr(ab.Frame, "_advance", stop)
+    words = f"run scene.toml --record {name} --device cpu".split()
+    assert run_command(capsys, *words, status=130)[1] == ["warp-abtree: interrupted"]
     text = Path(name).read_text()
     rows = json.loads(text) if name.endswith("json") else list(csv.DictReader(io.StringIO(text)))
     assert [int(row["frame"]) for row in rows] == [0, 1, 2]
@@ -184,21 +161,13 @@ sys.exit(main())
 """
 
 
-def test_the_version_needs_no_warp():
-    told = run_process("--version", STOP_AT, STOP_AT="warp", NUMBER=str(INTERRUPT.value), DELAY="0.01")
-    assert told == (0, f"warp-abtree {ab.__version__}\n", "")
-
-
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize(
     ("module", "number", "delay", "told"),
     [
-        ("warp", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
         ("pxr", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),  # of a command that runs already
         *slow_rows(
-            ("scipy.sparse", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
             ("trimesh", TERMINATE, 0.01, (143, "warp-abtree: terminated\n")),
-            ("trimesh.exchange.gltf", INTERRUPT, 0.01, (130, "warp-abtree: interrupted\n")),
             ("pxr", TERMINATE, 60.0, (143, "warp-abtree: terminated\n")),  # and that ends before it comes again
         ),
     ],
@@ -254,59 +223,27 @@ class Thing:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-def test_a_signal_after_the_last_code_changes_nothing():
-    told = run_process("--version", THING + "sys.kept = Thing()\nsys.exit(main())")
-    assert told == (0, f"warp-abtree {ab.__version__}\n", "")
-
-
-# A signal comes while a finaliser runs, of which Python drops what is raised, or at the end of the process.
-STOP_IN_DEL = (
-    THING
-    + """
-from warp_abtree.app.cli import model_commands
-
-def describe(mesh, described=model_commands.describe_mesh):
-    thing = Thing()
-    del thing
-    import time
-    for _ in range(300):
-        time.sleep(0.1)
-
-def print_last(*result, print_result=model_commands.print_result):
-    print_result(*result)
-    atexit.register(os.kill, os.getpid(), 2)
-
-PLACE
-sys.exit(main())
-"""
-)
-
-
-@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize(
-    ("place", "told"),
+    ("last", "status", "errors"),
     [
-        ("model_commands.print_result = print_last", (130, True, "warp-abtree: interrupted\n")),
-        *slow_rows(("model_commands.describe_mesh = describe", (130, False, "warp-abtree: interrupted\n"))),
+        ("sys.kept = Thing()", 0, ""),  # after the last code a signal changes nothing
+        ("atexit.register(os.kill, os.getpid(), 2)", 130, "warp-abtree: interrupted\n"),
     ],
 )
-def test_a_signal_while_something_ends_is_not_dropped(files, place, told):
-    status, shown, errors = run_process("info ball.obj --device cpu", STOP_IN_DEL.replace("PLACE", place))
-    assert (status, "diagonal" in shown, errors) == told
+def test_the_version_needs_no_warp_and_ends_as_a_signal_says(last, status, errors):
+    code = f"{THING}\nsys.modules['warp'] = None\nstatus = main()\n{last}\nsys.exit(status)"
+    assert run_process("--version", code) == (status, f"warp-abtree {ab.__version__}\n", errors)
 
 
-@pytest.mark.slow
-def test_a_warning_is_one_line(files):
-    Path("lines.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nl 1 2\n")
-    status, _, errors = run_process("info lines.obj --device cpu")
-    assert (status, errors) == (0, "warp-abtree: lines.obj: left out lines\n")
-
-
-def test_a_kernel_cache_that_cannot_be_written_names_its_variable(files, capsys):
-    status, _, errors = run_process("info ball.obj --device cpu", WARP_CACHE_PATH=str(files / "ball.obj" / "cache"))
-    assert status == 2 and errors.count("\n") == 1 and "ball.obj/cache" in errors
-    assert errors.endswith("(Warp's kernel cache; WARP_CACHE_PATH names a folder that can be written)\n")
-    _, (error,) = run_command(capsys, "info", "gone.obj", "--device", "cpu", status=2)
+def test_a_kernel_cache_that_cannot_be_written_names_its_variable(files, capsys, monkeypatch):
+    words, cache = ("info", "ball.obj", "--device", "cpu"), files / "ball.obj" / "cache"
+    with monkeypatch.context() as patch:
+        patch.setattr(wp.config, "kernel_cache_dir", str(cache))
+        patch.setattr(cli, "start_warp", lambda: os.makedirs(cache))
+        _, (error,) = run_command(capsys, *words, status=2)
+    assert "ball.obj/cache" in error
+    assert error.endswith(" (Warp's kernel cache; WARP_CACHE_PATH names a folder that can be written)")
+    _, (error,) = run_command(capsys, "info", "gone.obj", *words[2:], status=2)
     assert "WARP_CACHE_PATH" not in error
 
 
@@ -338,3 +275,69 @@ def test_ray_leaves_a_program_its_handler(monkeypatch):
             assert signal.getsignal(signal.SIGTERM) is kept
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_on_a_terminal_is_a_bar(monkeypatch):
+    pytest.importorskip("rich")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    stream, clock = Terminal(), iter([0.0, 0.1, *np.arange(1.0, 20.0)])
+    progress = progress_module.Progress(stream, clock=lambda: next(clock))
+    for done in (0, 1, 5, 10):
+        progress("LOD bounds", done, 10)
+    progress.close()
+    assert stream.getvalue().endswith("\x1b[2K"), "the bar is cleared"
+    for done in range(5):
+        progress.compiling(done, 4)
+    assert progress.stage is None and stream.getvalue().endswith("\x1b[2K")
+    shown = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", stream.getvalue()).replace("\r", "\n")
+    assert list(dict.fromkeys(re.findall(r"LOD bounds .* (\d+)%", shown))) == ["0", "50", "100"]
+    assert re.findall(r"compiling kernels .* (\d of 4)", shown)[-1] == "4 of 4"
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_progress_without_a_bar_is_a_line_a_stage(monkeypatch, terminal):
+    monkeypatch.setitem(sys.modules, "rich", None)
+    stream, clock = (Terminal if terminal else io.StringIO)(), iter(range(100))
+    progress = progress_module.Progress(stream, clock=lambda: next(clock))
+    for stage in ("collapse", "LOD bounds"):
+        for done in range(5):
+            progress(stage, done, 4)
+    progress.close()
+    assert stream.getvalue() == "collapse ...\nLOD bounds ...\n"
+
+
+def test_long_stages_are_estimated():
+    """At 5 s, and whenever twice the time has gone by: of 1,000 steps of a second each."""
+    stream, now = io.StringIO(), [0]
+    progress = progress_module.Progress(stream, clock=lambda: now[0])
+    for done in range(101):
+        now[0] = done
+        progress("frames", done, 1000)
+    progress("other", 0, 2)
+    now[0] += 7
+    progress("other", 1, 2)
+    progress("other", 1, 2)
+    seen = [(5, "0:16:35"), (10, "0:16:30"), (20, "0:16:20"), (40, "0:16:00"), (80, "0:15:20")]
+    lines = [f"frames: {done} of 1,000, about {left} left" for done, left in seen]
+    for done in range(8):
+        now[0] += 1
+        progress("frames", done, 10**30)
+    lines += ["other ...", "other: 1 of 2, about 0:00:07 left", "frames ..."]
+    *seen, last = stream.getvalue().splitlines()
+    assert seen == ["frames ...", *lines] and last.endswith(", about years left")
+
+
+def test_compiling_is_announced(tmp_path, monkeypatch):
+    stream, now = io.StringIO(), time.monotonic()
+    (tmp_path / f"wp_module_p{os.getpid()}_t1").mkdir()
+    monkeypatch.setattr(progress_module.wp.config, "kernel_cache_dir", str(tmp_path))
+    with progress_module.compile_notice(stream, delay=0.0):
+        while not stream.getvalue() and time.monotonic() < now + 5:
+            time.sleep(0.05)
+    assert stream.getvalue().count("\n") == 1 and "compiling" in stream.getvalue()

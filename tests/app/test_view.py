@@ -1,12 +1,11 @@
 """Playbacks of scene files and meshes; geometry of a snapshot, panels, and what a viewer scene sends."""
 
-import itertools
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers import refused
-from helpers.viewer import BODIES, make_models, make_playback, write_scene
+from helpers.viewer import BODIES, make_playback, write_scene
 from oracles.motion import posed
 
 import warp_abtree as ab
@@ -14,7 +13,7 @@ from warp_abtree.app import load_scene
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.pictures import scenes
 from warp_abtree.app.pictures.render import camera_around
-from warp_abtree.app.playback import ScenePlayback, open_playback, row_poses
+from warp_abtree.app.playback import ScenePlayback, open_playback
 from warp_abtree.app.render_data import Settings, compose, make_legend, objects_of_world
 from warp_abtree.app.styles import COLOURS
 from warp_abtree.app.viewer import viewer_scene as stages
@@ -51,7 +50,7 @@ def test_intersecting_faces_and_triangles(playback):
     assert set(only[:, 0].tolist()) == {0, 1} and len(only) < len(intersecting)
 
 
-def test_colours(playback):
+def test_colours_and_legend_tell_models_or_lods(playback):
     lods = np.array([0, playback.scene.lods[1], 1])
     plain, by_lod = (geometry.object_colours(playback.scene, lods, by_lod=by_lod) for by_lod in (False, True))
     assert np.array_equal(plain[:2], np.round([255 * np.array(COLOURS[i][0]) for i in (0, 1)]))
@@ -59,24 +58,11 @@ def test_colours(playback):
     part = np.linspace(0, 1, 50)[:, None, None]
     ramp = (1 - part) * geometry.COARSE + part * geometry.FINE
     assert np.linalg.norm(ramp - np.array([bright for _, bright in COLOURS]), axis=2).min() > 0.4
-
-
-def test_legend_tells_models_or_lods(playback):
-    cache = geometry.MeshCache(playback.scene)
-    data = compose(cache, playback.query("faces"), np.arange(3), Settings())
+    data = compose(geometry.MeshCache(playback.scene), playback.query("faces"), np.arange(3), Settings())
     names = [model.name for model in playback.scene.models]
     plain, by_lod = ([label for _, label in make_legend(playback.scene, [data], lods)] for lods in (False, True))
     assert plain == [names[0], f"{names[0]}, intersecting", names[1], f"{names[1]}, intersecting"]
     assert by_lod == ["coarsest LOD", "finest LOD", plain[1], plain[3]]
-
-
-def test_bounds_hold_all_that_is_shown(playback):
-    snapshot = playback.query("count")
-    centre, radius = geometry.bounds(geometry.MeshCache(playback.scene), snapshot, np.arange(3))
-    for i in range(3):
-        vertices = playback.scene.models[playback.scene.object_model[i]].mesh_at(int(snapshot.lods[i]))[0]
-        assert np.linalg.norm(posed(vertices, snapshot.poses[i]) - centre, axis=1).max() <= radius * (1 + 1e-9)
-    assert radius < 6
 
 
 def test_a_panel_holds_what_the_title_counts(playback):
@@ -209,7 +195,13 @@ def test_settings_reach_the_viewer_scene(playback):
     assert not show.api.handles["/boxes"].visible
 
 
-def test_distances_are_drawn_between_nearest_points(playback):
+def test_distances_are_drawn_between_nearest_points(playback, monkeypatch):
+    scene, result = playback.scene, playback.query("count").result
+    all_pairs, _ = geometry.nearest_points(scene, np.arange(3), result)
+    with monkeypatch.context() as patch:
+        patch.setattr(geometry, "FEW_OBJECTS", 2)  # of many objects, where boxes overlap
+        near, _ = geometry.nearest_points(scene, np.arange(3), result)
+    assert len(near) < len(all_pairs) and len(near) == (scene.intersect(result.pairs, "distance").distance > 0).sum()
     show = Show(playback)
     assert not len(show.show()[0].nearest) and "/distances" not in show.api.handles
     show.settings.distances = True
@@ -232,15 +224,6 @@ def test_distances_are_drawn_between_nearest_points(playback):
     show.settings.distances = False
     show.show()
     assert not show.api.handles["/distances"].visible and not show.api.handles["/distance/0"].visible
-
-
-def test_many_objects_have_distances_where_boxes_overlap(playback, monkeypatch):
-    scene, shown = playback.scene, np.arange(3)
-    result = playback.query("count").result
-    all_pairs, _ = geometry.nearest_points(scene, shown, result)
-    monkeypatch.setattr(geometry, "FEW_OBJECTS", 2)
-    near, _ = geometry.nearest_points(scene, shown, result)
-    assert len(near) < len(all_pairs) and len(near) == (scene.intersect(result.pairs, "distance").distance > 0).sum()
 
 
 def test_objects_of_a_model_and_lod_are_instances_of_one_mesh(playback, monkeypatch):
@@ -366,14 +349,3 @@ def test_rigid_bodies_are_shown_where_they_stand(tmp_path, device):
         apart = scene.intersect([(0, 1)], output="distance").distance[0]
         assert (apart < 1e-12) == (len(snapshot.result.faces) > 0)
     assert any(len(snapshot.result.faces) for snapshot in snapshots)
-
-
-def test_meshes_side_by_side_reach_into_each_other():
-    ball, ring = make_models()
-    boxes = []
-    for model, pose in zip((ball, ring, ball), row_poses([ball, ring, ball])):
-        vertices = model.mesh_at(model.lod_max)[0] + pose[:3]
-        boxes.append((vertices.min(axis=0), vertices.max(axis=0)))
-    for (_, upper), (lower, _) in itertools.pairwise(boxes):
-        assert upper[0] - lower[0] == pytest.approx(0.25 * 2.0)
-    assert np.allclose([0.5 * (low + high)[1:] for low, high in boxes], 0)

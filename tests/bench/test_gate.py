@@ -1,5 +1,10 @@
 """The gate finds what differs between two trees, and its worker answers alike twice."""
 
+import io
+import json
+import sys
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -39,16 +44,20 @@ def test_differences_are_rows():
     assert [row["kernel"] for row in rows] == ["k 32", "new 32"]
 
 
-def test_the_worker_answers_alike_and_says_what_failed(device):
-    tree = compare.Tree(compare.ROOT, device, True)
-    try:
-        first, again = (tree.ask("digest", name="ask_trees") for _ in range(2))
-        assert first == again and len(set(first.values())) == len(first) == 5
-        with pytest.raises(RuntimeError, match="StopIteration"):
-            tree.ask("digest", name="nothing")
-        assert tree.ask("first") == [1]
-    finally:
-        tree.close()
+def test_the_worker_answers_alike_and_says_what_failed(device, monkeypatch):
+    asked = [{"do": "digest", "name": name} for name in ("ask_trees", "ask_trees", "nothing")] + [{"do": "first"}]
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(map(json.dumps, asked))))
+    monkeypatch.setattr(sys, "stdout", answers := io.StringIO())
+    worker.serve(device, True)
+    answers.seek(0)
+    tree = compare.Tree.__new__(compare.Tree)
+    tree.process = SimpleNamespace(stdin=io.StringIO(), stdout=answers)
+    first, again = (tree.ask("digest") for _ in range(2))
+    assert first == again and len(set(first.values())) == len(first) == 5
+    with pytest.raises(RuntimeError, match="StopIteration"):
+        tree.ask("digest")
+    assert tree.ask("first") == [1]
+    assert [json.loads(line)["do"] for line in tree.process.stdin.getvalue().splitlines()] == [*3 * ["digest"], "first"]
 
 
 def test_digests_tell_arrays_apart():

@@ -1,4 +1,4 @@
-"""Newton's models in `NewtonContacts`: pairs, materials, particles, worlds, captures and order; nuts on bolts."""
+"""Newton's models in `NewtonContacts`: pairs, particles, worlds, order and match indices; nuts on bolts."""
 
 import importlib.util
 import pathlib
@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from helpers.bodies import PairContacts, at, collided, contact_rows, newton_mesh, settle, touching_shapes
+from helpers.bodies import PairContacts, at, collided, contact_rows, newton_mesh, touching_shapes
 
 import warp_abtree as ab
 
 newton = pytest.importorskip("newton")
-
 
 CUBE, FLOOR = newton_mesh(trimesh.creation.box((1, 1, 1))), newton_mesh(trimesh.creation.box((8, 8, 1)))
 RING = newton_mesh(trimesh.creation.torus(0.8, 0.25, 24, 12))
@@ -52,33 +51,6 @@ def test_pairs_are_those_of_newton(device):
     assert len(expected) > 50 and len(ours) > 10 and len(others) > 10
     assert not ours & others
     assert ours | others == expected
-
-
-def test_other_pairs_of_one_plane_are_as_many_as_bodies():
-    builder = newton.ModelBuilder()
-    builder.add_ground_plane()
-    for _ in range(300):
-        builder.add_shape_mesh(builder.add_body(), mesh=CUBE)
-    found = ab.NewtonContacts(builder.finalize(device="cpu"))
-    found.contacts(100)
-    assert found.others.shape_pairs_filtered.numpy().tolist() == [[0, k] for k in range(1, 301)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mu, slides", [(0.2, True), (0.8, False)])
-def test_friction_is_that_of_the_shapes(device, mu, slides):
-    """A cube on a slope of 0.4 rad, whose tangent is 0.42."""
-    slope = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), 0.4)
-    config = newton.ModelBuilder.ShapeConfig(gap=0.01, mu=mu)
-    builder = newton.ModelBuilder()
-    below, above = (wp.transform(wp.quat_rotate(slope, wp.vec3(0, 0, z)), slope) for z in (-0.5, 0.5))
-    builder.add_shape_mesh(-1, xform=below, mesh=FLOOR, cfg=config)
-    builder.add_shape_mesh(builder.add_body(xform=above), mesh=CUBE, cfg=config)
-    model = builder.finalize(device=device)
-    poses, _ = settle(model, ab.NewtonContacts(model), 120, iterations=8)
-    way = np.linalg.norm((poses - model.state().body_q.numpy())[0, :3])
-    # By friction alone it would slide 9.81 (sin - mu cos) t^2 / 2 = 0.25 m.
-    assert 0.15 < way < 0.35 if slides else way < 0.03
 
 
 @pytest.mark.slow  # Newton compiles much for it
@@ -138,33 +110,6 @@ def test_contacts_keep_their_order_as_bodies_move(device, monkeypatch):
             np.testing.assert_array_equal(one, two)
 
 
-@pytest.mark.slow
-def test_collide_in_a_capture_launches_only(device):
-    """A graph of collide and a solver's step has the bits of doing so step by step."""
-    model = ring_model(device, 2)
-    ends = []
-    for captured in (False, True):
-        found, state, after = ab.NewtonContacts(model), model.state(), model.state()
-        solver, control, contacts = newton.solvers.SolverXPBD(model), model.control(), found.contacts()
-
-        def step(found=found, solver=solver, state=state, after=after, control=control, contacts=contacts):
-            found.collide(state, contacts)
-            state.clear_forces()
-            solver.step(state, after, control, contacts, 1 / 240)
-            state.assign(after)
-
-        step()
-        if captured:
-            with wp.ScopedCapture(device) as capture:
-                step()
-        for _ in range(20):
-            wp.capture_launch(capture.graph) if captured else step()
-        found.check(contacts)
-        ends.append(state.body_q.numpy().copy())
-    assert np.abs(ends[0][:, 2] - model.body_q.numpy()[:, 2]).max() > 1e-4
-    np.testing.assert_array_equal(*ends)
-
-
 @pytest.fixture(scope="module")
 def scene():
     path = pathlib.Path(__file__).parents[2] / "scenes/interop/newton_nut_and_bolt.py"
@@ -210,11 +155,146 @@ def test_hammered_nuts_stay_on_their_threads(scene, device, tolerance):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", ["xpbd", "mujoco"])
-def test_nuts_follow_the_pitch(scene, device, solver):
-    if solver == "mujoco":
-        pytest.importorskip("mujoco_warp")
-    nuts = make_nuts(scene, solver, device, 1)
+def test_nuts_follow_the_pitch(scene, device):
+    pytest.importorskip("mujoco_warp")
+    nuts = make_nuts(scene, "mujoco", device, 1)
     nuts.run(1.5)
     assert (nuts.turned < -1).all()
     np.testing.assert_allclose(nuts.travel(), 1, atol=0.05)
+
+
+COUNT = 4
+
+
+@pytest.fixture(name="world")
+def make_world(device):
+    """Cubes side by side on a floor; returns what finds contacts, the state, and a function that moves the cubes."""
+    builder, config = newton.ModelBuilder(), newton.ModelBuilder.ShapeConfig(gap=0.02)
+    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=FLOOR, cfg=config)
+    for k in range(COUNT):
+        body = builder.add_body(xform=at(2.0 * k - 3.0, 0.2, 0.495, angle=0.1 * k))
+        builder.add_shape_mesh(body, mesh=CUBE, cfg=config)
+    model = builder.finalize(device=device)
+    state = model.state()
+    start = state.body_q.numpy().copy()
+
+    def move(shift):
+        poses = start.copy()
+        poses[:, :3] += shift
+        state.body_q.assign(poses)
+
+    return model, state, move
+
+
+def rows(contacts):
+    """Return shapes (n, 2), first points and match indices of contacts."""
+    first, second, point, index = contact_rows(contacts, "shape0", "shape1", "point0", "match_index")
+    return np.stack([first, second], 1), point, index
+
+
+def check_matches(now, before):
+    """Check that matched contacts are of the same shapes and nearly in the same place, each matched once."""
+    shapes, point, index = now
+    kept = index >= 0
+    np.testing.assert_array_equal(shapes[kept], before[0][index[kept]])
+    assert np.abs(point[kept] - before[1][index[kept]]).max(initial=0) < 0.02
+    assert len(np.unique(index[kept])) == kept.sum()
+    return kept
+
+
+def test_contacts_that_stay_are_matched(device, world):
+    """As cubes rest, slide, lift off and come back; pairs shift their places among the others."""
+    model, state, move = world
+    found = ab.NewtonContacts(model)
+    contacts = found.contacts()
+    rng, before, generation, seen = np.random.default_rng(0), None, None, set()
+    lifted_before = np.zeros(COUNT, bool)
+    for step in range(25):
+        lifted = rng.random(COUNT) < 0.3
+        shift = np.zeros((COUNT, 3))
+        shift[:, 0] = 0.004 * np.sin(step) * (np.arange(COUNT) % 2)  # half of them slide, by more than rests
+        shift[lifted, 2] = 1.0
+        move(shift)
+        found.collide(state, contacts)
+        now = rows(contacts)
+        match_generation = int(contacts.rigid_contact_match_generation.numpy()[0])
+        if before is None:
+            assert (now[2] == -1).all() and match_generation == -1
+        else:
+            assert match_generation == generation
+            kept = check_matches(now, before)
+            cube = now[0].max(1) - 1
+            # Those of cubes that have come back are new; the corners of the others are those that they were.
+            np.testing.assert_array_equal(kept, ~lifted_before[cube])
+            seen |= set(zip(now[2][kept] != np.flatnonzero(kept), found.query.memory.place.numpy()[cube[kept]] >= 0))
+        before, lifted_before, generation = now, lifted, int(contacts.contact_generation.numpy()[0])
+    assert {shifted for shifted, _ in seen} == {False, True}
+
+
+def test_a_graph_matches(device, world):
+    model, state, move = world
+    found = ab.NewtonContacts(model)
+    contacts = found.contacts()
+    found.collide(state, contacts)
+    with wp.ScopedCapture(wp.get_device(device)) as capture:
+        found.collide(state, contacts)  # launches only, where a graph is captured
+    for step in range(4):
+        before = rows(contacts)
+        move([[0.003 * step, 0, 0]])
+        wp.capture_launch(capture.graph)
+        assert check_matches(rows(contacts), before).all()
+
+
+def test_without_memory_nothing_matches(device, world):
+    model, state, _ = world
+    found = ab.NewtonContacts(model, remember=False)
+    assert found.contacts().rigid_contact_match_index is None
+    contacts = newton.Contacts(200, 0, device=device, contact_matching=True)
+    for _ in range(2):
+        found.collide(state, contacts)
+        assert (rows(contacts)[2] == -1).all()
+
+
+def test_contents_of_others_do_not_match(device, world):
+    """Another finder writes the buffer, it is cleared, or others are written or the query is launched in between."""
+    model, state, _ = world
+    found, other = ab.NewtonContacts(model), ab.NewtonContacts(model)
+    contacts, second, plain = found.contacts(), found.contacts(), newton.Contacts(200, 0, device=device)
+
+    def launch_apart():
+        poses = np.tile([0, 0, 0, 0, 0, 0, 1.0], (COUNT + 1, 1))
+        poses[:, 0] = 100 * np.arange(COUNT + 1)
+        found.scene.set_poses(poses)
+        found.query.run()
+
+    actions = [lambda: other.collide(state, contacts), contacts.clear, launch_apart]
+    actions += [lambda each=each: found.collide(state, each) for each in (second, plain)]
+    for between in actions:
+        found.collide(state, contacts)
+        between()
+        found.collide(state, contacts)
+        assert (rows(contacts)[2] == -1).all() and len(rows(contacts)[2]) == 4 * COUNT
+        assert contacts.rigid_contact_match_generation.numpy()[0] == -1
+        found.collide(state, contacts)
+        assert (rows(contacts)[2] >= 0).all()
+    for _ in range(12):  # new ones lie where those before lay
+        found.collide(state, new := found.contacts())
+        assert (rows(new)[2] == -1).all()
+        del new
+
+
+def test_room_that_grows_keeps_matches(device, world):
+    """Two cubes rest while others arrive that there is no room for yet."""
+    model, state, move = world
+    lifted = np.zeros((COUNT, 3))
+    lifted[2:, 2] = np.arange(2, COUNT) * 5
+    move(lifted)
+    found = ab.NewtonContacts(model, capacity=ab.Buffers(pairs=2))
+    contacts = newton.Contacts(200, 0, device=device, contact_matching=True)
+    found.collide(state, contacts)
+    before, room = rows(contacts), len(found.query.pairs)
+    move(0 * lifted)
+    found.collide(state, contacts)
+    assert len(found.query.pairs) > room
+    now = rows(contacts)
+    np.testing.assert_array_equal(check_matches(now, before), now[0].max(1) <= 2)

@@ -142,22 +142,3 @@ def test_arrays_of_frameworks_share_memory(scene, framework):
         poses.launch(array)
         assert_same(scene, query, rows)
     assert address_of(view_of(query.hits.any_hit)) == query.hits.any_hit.ptr
-
-
-def test_poses_and_results_in_place_in_torch(scene):
-    torch = pytest.importorskip("torch")
-    poses, query, frame = ab.PoseInput(scene), ab.Query(scene, "count"), ab.Pipeline(scene, output="count")
-    wp.to_torch(poses.poses).copy_(torch.tensor(poses_of(11)))
-    poses.launch()
-    assert_same(scene, query, poses_of(11))
-    hit = wp.to_torch(query.hits.any_hit)
-    assert int((hit[: int(query.pair_count.numpy()[0])] != 0).sum()) == int(expected(scene, poses_of(11)).any.sum())
-    wp.to_torch(frame.poses).copy_(torch.tensor(poses_of(12)))
-    frame.launch()
-    assert wp.to_torch(frame.query.hits.count).sum() == expected(scene, poses_of(12)).count.sum()
-    contacts = ab.ContactQuery(scene, capacity=4096)
-    contacts.launch()
-    p0 = wp.to_torch(contacts.contacts.p0)
-    assert p0.shape == (4096, 3) and p0.data_ptr() == contacts.contacts.p0.ptr
-    count = int(wp.to_torch(contacts.start)[-1])
-    assert np.array_equal(p0[:count].cpu().numpy(), contacts.result().contacts["p0"]) and count > 0

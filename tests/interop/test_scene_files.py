@@ -49,19 +49,6 @@ def assert_matches(scene, names, meshes, tolerance=1e-12):
         assert np.allclose(posed_triangles(scene, i), meshes[name].triangles, atol=tolerance), name
 
 
-def test_trimesh_scene_in():
-    source = assembly(with_extras=True)
-    scene = ab.scene_from_trimesh(source, device="cpu")
-    names = names_of(scene)
-    meshes = {name: mesh for name, mesh in nodes_in_the_world(source).items() if isinstance(mesh, trimesh.Trimesh)}
-    assert_matches(scene, names, meshes)
-    # Rigid, doubled, mirrored, flattened: four of each geometry.
-    assert len(scene.models) == 8 and len(names) == 12
-    for i, model in enumerate(scene.models):
-        vertices, faces, _ = model.mesh_at(model.lod_max)
-        assert trimesh.Trimesh(vertices, faces).volume > 0, f"model {i} is inside out"
-
-
 def test_sources_refused(tmp_path):
     refused(TypeError, r"Trimesh, not a trimesh\.Scene", ab.scene_from_trimesh, trimesh.creation.box())
     refused(ab.MeshError, "no node with a mesh", ab.scene_from_trimesh, trimesh.Scene([trimesh.PointCloud(np.eye(3))]))
@@ -195,25 +182,6 @@ def test_usd_shapes_are_read_as_meshes(tmp_path, kind):
         assert inside.min() > -1e-5 and curved.max(initial=0) < 0.002 * values.get("radius", 0) + 1e-5
 
 
-def test_usd_planes(tmp_path):
-    pytest.importorskip("pxr")
-    from pxr import Usd, UsdGeom
-
-    stage = Usd.Stage.CreateNew(str(tmp_path / "planes.usda"))
-    sizes = {"X": (0, 3, 2), "Y": (2, 0, 3), "Z": (2, 3, 0)}
-    for axis in sizes:
-        plane = UsdGeom.Plane.Define(stage, f"/{axis}")
-        plane.GetAxisAttr().Set(axis), plane.GetWidthAttr().Set(2.0), plane.GetLengthAttr().Set(3.0)
-    stage.GetRootLayer().Save()
-    scene = ab.scene_from_file(tmp_path / "planes.usda", device="cpu")
-    names = names_of(scene)
-    for i, name in enumerate(names):
-        found = posed_triangles(scene, i)
-        assert np.ptp(found.reshape(-1, 3), axis=0).tolist() == list(sizes[name[1]]) and len(found) == 2
-        assert np.allclose(trimesh.triangles.normals(found)[0], np.eye(3)["XYZ".index(name[1])])
-        assert trimesh.triangles.area(found).sum() == pytest.approx(6.0)
-
-
 def test_what_usd_hides_is_left_out_and_named(tmp_path):
     """Invisible prims with all under them, hidden and inactive instances, and geometry of other kinds."""
     pytest.importorskip("pxr")
@@ -296,17 +264,25 @@ def test_usd_purposes_and_what_is_not_carried_out(tmp_path):
     assert "not subdivided: /smooth (catmullClark)" in said and "taken at rest: /skinned (skin or blend" in said
 
 
-@pytest.mark.parametrize("turned", range(4))
-def test_usd_polygons_do_not_fold(tmp_path, turned):
+def test_usd_polygons_do_not_fold_and_planes_have_an_axis(tmp_path):
     pytest.importorskip("pxr")
-    from pxr import Usd
+    from pxr import Usd, UsdGeom
 
-    letter = np.roll([(4, 1), (1, 1), (1, 3), (4, 3), (4, 4), (0, 4), (0, 0), (4, 0)], turned, axis=0)
-    stage = Usd.Stage.CreateNew(str(tmp_path / "letter.usda"))
-    define_mesh(stage, "/letter", np.insert(letter, 2, 0, 1), [range(8)])
+    letter = [(4, 1), (1, 1), (1, 3), (4, 3), (4, 4), (0, 4), (0, 0), (4, 0)]
+    stage = Usd.Stage.CreateNew(str(tmp_path / "flat.usda"))
+    define_mesh(stage, "/L", np.insert(letter, 2, 0, 1), [range(8)])
+    sizes = {"X": (0, 3, 2), "Y": (2, 0, 3), "Z": (2, 3, 0)}
+    for axis in sizes:
+        plane = UsdGeom.Plane.Define(stage, f"/{axis}")
+        plane.GetAxisAttr().Set(axis), plane.GetWidthAttr().Set(2.0), plane.GetLengthAttr().Set(3.0)
     stage.GetRootLayer().Save()
-    scene = ab.scene_from_file(tmp_path / "letter.usda", device="cpu")
-    assert trimesh.triangles.area(posed_triangles(scene, 0)).sum() == pytest.approx(10)
+    scene = ab.scene_from_file(tmp_path / "flat.usda", device="cpu")
+    found = {name[1]: posed_triangles(scene, i) for i, name in enumerate(names_of(scene))}
+    assert trimesh.triangles.area(found.pop("L")).sum() == pytest.approx(10)
+    for axis, triangles in found.items():
+        assert np.ptp(triangles.reshape(-1, 3), axis=0).tolist() == list(sizes[axis]) and len(triangles) == 2
+        assert np.allclose(trimesh.triangles.normals(triangles)[0], np.eye(3)["XYZ".index(axis)])
+        assert trimesh.triangles.area(triangles).sum() == pytest.approx(6.0)
 
 
 def red_faces(mesh):
@@ -338,10 +314,16 @@ def test_coloured_result_out(device, tmp_path):
         assert len(red_faces(whole[name])) == (len(whole[name].faces) if i in intersecting else 0)
 
 
-def test_plain_scene_out_and_in(tmp_path):
+def test_plain_scene_in_and_out_and_in(tmp_path):
     source = assembly()
-    scene = ab.scene_from_trimesh(source, device="cpu")
+    scene = ab.scene_from_trimesh(assembly(with_extras=True), device="cpu")
     names = names_of(scene)
+    assert_matches(scene, names, nodes_in_the_world(source))
+    # Rigid, doubled, mirrored, flattened: four of each geometry.
+    assert len(scene.models) == 8 and len(names) == 12
+    for i, model in enumerate(scene.models):
+        vertices, faces, _ = model.mesh_at(model.lod_max)
+        assert trimesh.Trimesh(vertices, faces).volume > 0, f"model {i} is inside out"
     out = ab.to_trimesh(scene)
     assert len(out.geometry) == 8, "instances share a geometry"
     again = ab.scene_from_trimesh(out, device="cpu")

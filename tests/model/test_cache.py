@@ -86,24 +86,17 @@ def test_a_file_that_comes_again_is_opened(folder, built, ball):
     assert ab.Model.load(ball.with_name("copy.obj")).name == "copy" and built == ["ball"]
 
 
-def test_certified_errors_are_kept_when_there_are_any(folder, ball, monkeypatch):
-    first = ab.Model.load(ball)
-    assert first.progressive.known_error is None and len(list(folder.iterdir())) == 1
-    errors = first.progressive.lod_error
-    assert len(list(folder.iterdir())) == 2
+@pytest.mark.parametrize("when", ["beside the collapse", "of a model that is found", "asked"])
+def test_certified_errors_are_kept(folder, ball, monkeypatch, when):
+    if when == "of a model that is found":
+        ab.Model.load(ball)
+    model = ab.Model.load(ball, certify=when != "asked")
+    assert (when == "beside the collapse") == (model.progressive.known_error is not None)
+    assert len(list(folder.iterdir())) == (1 if when == "asked" else 2)
+    errors = ab.Model.load(ball, cache=False).progressive.lod_error
+    assert np.array_equal(model.progressive.lod_error, errors) and len(list(folder.iterdir())) == 2
     monkeypatch.setattr(progressive_module, "certify_errors", lambda *_: pytest.fail("certified again"))
     assert np.array_equal(ab.Model.load(ball).progressive.lod_error, errors)
-    monkeypatch.undo()
-
-
-@pytest.mark.parametrize("beside", [False, True])
-def test_errors_can_be_certified_at_once(folder, ball, beside):
-    """Beside the collapse, or of a model that is found without them; either way they are kept."""
-    if not beside:
-        ab.Model.load(ball)
-    model = ab.Model.load(ball, certify=True)
-    assert beside == (model.progressive.known_error is not None) and len(list(folder.iterdir())) == 2
-    assert np.array_equal(model.progressive.lod_error, ab.Model.load(ball, cache=False).progressive.lod_error)
 
 
 @pytest.mark.parametrize("damage", [truncate, alter, other_errors])

@@ -51,20 +51,6 @@ def some_lods(model, count=6):
     return sorted({*np.geomspace(1, m + 1, count).astype(int) - 1, *np.linspace(0, m, count).astype(int)})
 
 
-BOX = trimesh.creation.box().subdivide().subdivide().subdivide()
-
-
-def test_flat_regions_cost_nothing():
-    """A LOD within the original surface, or within rounding of it, has a bound of that size; edges do not spoil it."""
-    for name in ("one", "ball", "soup", "lattice soup", "twins"):
-        model = sample(name)
-        assert model.error_at(model.lod_max, side="outward") == 0.0
-    for shape in (grid(12), turned(*grid(12)), of_trimesh(BOX), turned(*of_trimesh(BOX))):
-        model = ab.Model.from_arrays(*shape)
-        size = np.ptp(original(model), axis=(0, 1)).max()
-        assert model.error_at(model.lod_for(fraction=0.1), side="outward") < 1e-8 * size
-
-
 @st.composite
 def models(draw):
     """Soups with repeated and degenerate faces, crumbs, flat grids and balls, out of shape and far from the origin."""
@@ -104,11 +90,8 @@ def test_no_point_is_farther(model, share):
 
 EXACT = {
     "flat grid": lambda: turned(*grid(2), seed=1),
-    "line": lambda: line((1.0, 2.0, -1.0), 9),
     "turned line": lambda: line(np.random.default_rng(9).normal(size=3), 6),
     "box": lambda: turned(*of_trimesh(trimesh.creation.box())),
-    "comb": lambda: turned(*square_comb(2)),
-    "soup": lambda: soup(12, 5),
     "lattice soup": lambda: soup(20, 6, lattice=3),
     "far away": lambda: (turned(*grid(2))[0] + 1e6 * np.random.default_rng(0).normal(size=3), grid(2)[1]),
 }
@@ -137,7 +120,7 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("name", [*SHAPES, *slow("cow", "fandisk", "rocker-arm", "stanford-bunny")])
+@pytest.mark.parametrize("name", [*SHAPES, *slow("cow", "fandisk")])
 def test_it_is_tight(name):
     known = name in SHAPES
     model = ab.Model.from_arrays(*SHAPES[name](), base_faces=4) if known else ab.Model.load(real_mesh_path(name))

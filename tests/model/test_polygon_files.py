@@ -139,8 +139,9 @@ def check_cover(triangles, polygon):
             assert sum(crosses(ring, point) for ring in flat) == crosses(polygon, point)
 
 
-@pytest.mark.parametrize("name", WRITERS)
-@pytest.mark.parametrize("shape", POLYGONS)
+@pytest.mark.parametrize(
+    "name, shape", [*((name, "linked holes") for name in WRITERS), *(("a.obj", shape) for shape in POLYGONS)]
+)
 def test_polygons_are_covered_once(tmp_path, name, shape):
     """In the order of the file, beside triangles and quads, by both ways in."""
     if name.endswith(".dae"):
@@ -291,6 +292,7 @@ def test_damaged_files(tmp_path, name, data, message, monkeypatch):
         ("a.ply", ply(LETTER, FACES, "<") + b"more", 6, "left out what follows"),
         ("a.ply", ply(LETTER, FACES).replace(b"element face", b"element edge 0\nelement face"), 6, None),
         ("a.off", off(LETTER, FACES) + b"3 0 1 2\n", 6, "left out 1 lines"),
+        ("a.obj", b"\xef\xbb\xbf" + obj(LETTER, FACES), 6, None),
         ("a.obj", obj(LETTER, FACES) + b"l 1 2\np 3\n", 6, "left out lines, points"),
         ("a.obj", obj(LETTER, FACES) + b"fo 1 2 3\nbsp 1 2\n", 6, "left out faces as 'fo', free-form surfaces"),
         ("a.zip", zipped(obj(LETTER, FACES), "a.obj", "b.obj.gz"), 6, "left out b.obj.gz"),

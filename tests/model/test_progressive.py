@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from helpers import refused, samples
-from helpers.samples import REAL_MESHES, of_trimesh
+from helpers import samples
+from helpers.samples import of_trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oracles.distance import brute_distances, farthest_points
@@ -202,8 +202,7 @@ def test_components_go_last_and_smallest_first():
     assert np.array_equal(falls, np.arange(len(falls))), "a component went before an ordinary merge"
 
 
-@pytest.mark.parametrize("certify", [False, True], ids=["later", "beside"])
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(("threads", "certify"), [(1, True), (2, False)])
 def test_the_result_does_not_depend_on_launches(mesh, monkeypatch, threads, certify):
     first = build_progressive(mesh, base_faces=1)
     assert first.known_error is None and len(first.lod_error) == first.lod_max + 1
@@ -241,11 +240,10 @@ def test_scale_changes_nothing(mesh, power):
         assert np.ldexp(bounds[0].at(lod), power) == bounds[1].at(lod)
 
 
-@pytest.mark.parametrize("offset", [1e3, 1e9])
 @pytest.mark.slow
-def test_far_from_the_origin(offset):
+def test_far_from_the_origin():
     mesh = mesh_from_arrays(*bumpy_grid())
-    far = mesh_from_arrays(mesh.vertices + [offset, -offset, 0.3 * offset], mesh.faces)
+    far = mesh_from_arrays(mesh.vertices + [1e9, -1e9, 3e8], mesh.faces)
     progressive = build_progressive(far, base_faces=4)
     replay(far, progressive)
     # rounding breaks ties differently, so the sequences differ; their quality must not
@@ -264,33 +262,28 @@ def test_error_is_tight(name, limit, real_mesh_path):
     known = name in MESHES
     mesh = mesh_from_arrays(*MESHES[name]()) if known else load_mesh(real_mesh_path(name))
     progressive = build_progressive(mesh, base_faces=4 if known else 10)
-    lods = np.linspace(progressive.lod_max - 1, 0, 40).astype(int)
+    lods = np.linspace(progressive.lod_max - 1, 0, 10).astype(int)
     worst = 0.0
     for lod in lods if known else [progressive.lod_for(fraction=fraction) for fraction in (0.1, 0.01)]:
         worst = max(worst if known else 0.0, measured_error(mesh, progressive, lod))
         assert progressive.lod_error[lod] <= limit * worst
 
 
-def test_bad_input_is_refused():
-    mesh = mesh_from_arrays(*MESHES["torus"]())
-    refused(ValueError, "base_faces", build_progressive, mesh, base_faces=0)
-    progressive = build_progressive(mesh)
-    for lod in (-1, progressive.lod_max + 1, 0.5):
-        refused(ValueError, "lod", progressive.mesh_at, lod)
-
-
 def test_flat_regions_cost_nothing():
     for name, count in (("box", 12), ("flat grid", 2)):
-        progressive = build_progressive(mesh_from_arrays(*MESHES[name]()), base_faces=count)
-        assert progressive.lod_error[progressive.lod_for(fraction=count / progressive.face_count)] < 1e-6, name
+        mesh = mesh_from_arrays(*MESHES[name]())
+        progressive, size = build_progressive(mesh, base_faces=count), np.ptp(mesh.vertices, axis=0).max()
+        lod = progressive.lod_for(fraction=count / progressive.face_count)
+        assert progressive.lod_error[lod] < 1e-6, name
+        outward = OutwardError(progressive, active_build(progressive.vertex_pos, progressive.face_vertex))
+        assert outward.at(lod) < 1e-8 * size and outward.at(progressive.lod_max) == 0, name
 
 
-@pytest.mark.parametrize("name", REAL_MESHES)
+@pytest.mark.parametrize("name", ["cow", "fandisk", "fcl-env", "homer"])
 @pytest.mark.slow
 def test_real_meshes(name, real_mesh_path):
     mesh = load_mesh(real_mesh_path(name))
     progressive = build_progressive(mesh)
     assert progressive.active_count(0) <= 10
-    if len(mesh.faces) < 30_000:
-        replay(mesh, progressive)
+    replay(mesh, progressive)
     check_error(mesh, progressive, steps=4, count=2000)

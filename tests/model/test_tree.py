@@ -118,17 +118,17 @@ class Walker:
             assert (k, nodes) in [(update.k, update.nodes_refitted) for update in counted]
 
 
-@pytest.mark.parametrize("name", ["cow", "fcl-env", "woody"])
+@pytest.mark.parametrize("name", ["cow", "fcl-env"])
 @pytest.mark.slow
 @pytest.mark.usefixtures("update_path")
 def test_random_walk_of_real_meshes(device, name):
     rng = np.random.default_rng(4)
     walker = Walker([sample(name)], [0, 0, 0], device)
     top, partial = walker.tops(), 0
-    for t in range(25):
+    for t in range(12):
         lods = np.clip((top * rng.choice([0.0, 0.1, 0.5, 0.9, 1.0], 3)).astype(int) + rng.integers(-30, 31, 3), 0, top)
-        partial += walker.step(lods, with_oracle=t % 12 == 11)
-    assert partial > 5
+        partial += walker.step(lods, with_oracle=t == 11)
+    assert partial > 3
 
 
 soups = st.builds(
@@ -207,7 +207,7 @@ def test_objects_share_states(device):
 def test_thousands_of_objects_in_one_batch(device):
     rng = np.random.default_rng(7)
     models = [sample(name) for name in ("small ball", "crumbs", "twins", "one")]
-    walker = Walker(models, rng.integers(0, 4, 5000).tolist(), device)
+    walker = Walker(models, rng.integers(0, 4, 1000).tolist(), device)
     ladders = [np.unique(np.linspace(0, model.lod_max, 50).astype(int)) for model in models]
     for _ in range(3):
         lods = np.array([rng.choice(ladders[m]) for m in walker.objects])

@@ -88,20 +88,6 @@ def test_states_are_those_in_use(device, allocations, fractions):
     assert many < one + 1000 * 120 + SLACK, "objects that share a state cost no more than a pose and a number"
 
 
-def test_an_lod_that_was_left_is_used_again(device, allocations):
-    """LODs that wander for long hold one state, and what was allocated stays where it is."""
-    scene = make_scene(device, 3)
-    lods = [scene.lods // 2, scene.lods // 3, scene.lods]
-
-    def wander(times):
-        for target in lods * times:
-            scene.set_lods(target)
-
-    wander(1)
-    more, _ = allocations.gained(lambda: wander(3))
-    assert len(scene.batch().states.slots) == 1 and abs(more) <= SLACK
-
-
 def query_bytes(allocations, kind, scene, pairs, output, **options):
     def make():
         query = kind(scene, output, pairs=pairs, **options)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
-from conftest import slow
+from conftest import slow, slow_rows
 from helpers import faults, scenes
 from helpers.faults import MORE_PAIRS, PAIRS, add_objects, check_scene, describe, make_scene
 from helpers.samples import random_poses, sample
@@ -23,13 +23,7 @@ from helpers.scenes import everything
 import warp_abtree as ab
 from warp_abtree.checks.cpu_threads import core_count
 
-MOVES = {
-    "in place": [0, 7, 0, 7],
-    "one apart": [0, 3, 5, 9],
-    "pool grows": [0, 3, 5, 9],
-    "all apart": [2, 30, 11, 60],
-    "coarsest": [-1, -1, -1, -1],
-}
+MOVES = {"one apart": [0, 3, 5, 9], "pool grows": [2, 30, 11, 60]}
 
 
 @pytest.fixture(params=faults.FAULTS)
@@ -41,7 +35,7 @@ def move_lods(scene, move):
     return scene.set_lods(np.zeros(4, int) if move == "coarsest" else scene.lods - MOVES[move])
 
 
-@pytest.mark.parametrize("move", ["one apart", *slow("in place", "pool grows", "all apart", "coarsest")])
+@pytest.mark.parametrize("move", ["one apart", *slow("pool grows", "coarsest")])
 def test_lods(device, fault, move):
     """States that move, are copied, taken again and new; also the next change is that of a scene without a fault."""
 
@@ -63,7 +57,7 @@ def test_lods(device, fault, move):
     assert fault.everywhere(make, lambda scene: move_lods(scene, move), check)[0] > 1
 
 
-@pytest.mark.parametrize("move", ["one apart", *slow("in place", "all apart", "coarsest")])
+@pytest.mark.parametrize("move", ["one apart", *slow("coarsest")])
 def test_graphs_and_queries_beside_lods(device, monkeypatch, move):
     """A query that was made before, and its graph, answer as before or refuse, while the scene is torn and after."""
 
@@ -114,10 +108,10 @@ EDITS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("edit", EDITS)
-def test_an_edit(device, fault, edit):
+@pytest.mark.parametrize(("kind", "edit"), [*(("interruption", edit) for edit in EDITS), ("memory", "remove")])
+def test_an_edit(device, monkeypatch, kind, edit):
     """It is made, or not; poses and LODs of the others stay where they were set, not where they were added."""
-    change, is_made = EDITS[edit]
+    fault, (change, is_made) = faults.FAULTS[kind](device, monkeypatch), EDITS[edit]
 
     def make():
         scene = make_scene(device)
@@ -162,9 +156,8 @@ REQUESTS = {
 }
 
 
-@pytest.mark.parametrize("pairs", ["given", *slow("found")])
 @pytest.mark.parametrize("asked", REQUESTS)
-@pytest.mark.parametrize("kind", ["interruption", *slow("memory")])
+@pytest.mark.parametrize(("kind", "pairs"), [("interruption", "given"), *slow_rows(("memory", "found"))])
 def test_requests(device, monkeypatch, kind, asked, pairs):
     """More pairs than the scene was asked before, with what belongs to each, and more hits than it had room for."""
     fault, options = faults.FAULTS[kind](device, monkeypatch), REQUESTS[asked]

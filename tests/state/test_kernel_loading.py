@@ -77,14 +77,20 @@ def test_one_core_waits_for_the_launches(device, monkeypatch):
 
 def test_an_error_ends_it_and_is_said_again(device, monkeypatch):
     """Of the work beside first, then of the compiler."""
-    loaded, device, kernels = loads_of(monkeypatch, 2), wp.get_device(device), make_kernels(3, "no code {};", 1)
+    told, device, kernels = threading.Event(), wp.get_device(device), make_kernels(3, count=1)
+
+    def fail(*_):
+        told.set()
+        raise RuntimeError("build failed")
+
+    monkeypatch.setattr(kernel_loading, "core_count", lambda: 2)
+    monkeypatch.setattr(wp, "force_load", fail)
     with pytest.raises(KeyError, match="beside"), kernel_loading.loading(device, kernels):
         raise KeyError("beside")
     for _ in range(2):
-        loaded.clear()
-        with pytest.raises(Exception, match="build failed"), kernel_loading.loading(device, kernels):
-            while not loaded:  # so that the other thread is told
-                time.sleep(0.001)
+        told.clear()
+        with pytest.raises(RuntimeError, match="build failed"), kernel_loading.loading(device, kernels):
+            assert told.wait(60), "the other thread is told"
 
 
 def compile_ahead(monkeypatch, device, cores, kernels, number):
@@ -106,7 +112,7 @@ def compile_ahead(monkeypatch, device, cores, kernels, number):
 
 def test_kernels_of_a_query_are_compiled_beside_a_build(device, monkeypatch):
     """As a launch finds them, where there are cores."""
-    kernels = make_kernels(time.time_ns() % 10**7)
+    kernels = make_kernels(time.time_ns() % 10**7, count=2)
     assert compile_ahead(monkeypatch, device, 1, kernels, 0) == 0
     assert compile_ahead(monkeypatch, device, 4, kernels, len(kernels)) == len(kernels)
     for kernel, block_dim in kernels:
