@@ -175,30 +175,6 @@ def test_apart_inside_and_touching(device):
     np.testing.assert_allclose(flat.points["depth"], 0.01, atol=1e-9)
 
 
-def test_a_pair_named_the_other_way_turns_its_normals(device):
-    cube = box(1, 1, 1)
-    placed = (cube, STILL), (cube, (0.3, 0.2, 0.9, *about((1, 2, 3), 0.4)))
-    forth = ask_points(device, *placed, pairs=[(0, 1)])[1].points
-    back = ask_points(device, *placed, pairs=[(1, 0)])[1].points
-    assert len(forth["pair"]) == len(back["pair"])
-    np.testing.assert_allclose(np.sort(forth["depth"]), np.sort(back["depth"]), atol=1e-12)
-    turned = [rows[np.lexsort(np.round(rows, 9).T)] for rows in (forth["normal"], -back["normal"])]
-    np.testing.assert_allclose(*turned, atol=1e-9)
-
-
-def test_room_grows_and_changes_nothing(device):
-    rng = np.random.default_rng(1)
-    placed = [(box(1, 0.8, 0.6, splits=1), pose) for pose in random_poses(rng, 12, 1.2)]
-    _, ample = ask_points(device, *placed, capacity=ab.Buffers(10_000, pairs=1000))
-    query, tight = ask_points(device, *placed, capacity=ab.Buffers(1, pairs=1))
-    assert tight.pairs.tolist() == ample.pairs.tolist() == sorted(ample.pairs.tolist())
-    assert len(tight.points["pair"]) > 12
-    query.launch()
-    for name, values in ample.points.items():
-        for points in (tight.points, query.result().points):
-            assert np.array_equal(values, points[name]), name
-
-
 @pytest.mark.parametrize("most", [8, 24])
 def test_points_are_as_many_as_asked_for(device, most):
     """A ball in a cavity is near all around: more points leave smaller caps of directions without one, none twice."""
