@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from helpers import refused, scenes
 from helpers.faults import MORE_PAIRS, add_objects, describe
-from helpers.questions import GpuQuery, in_a_row
+from helpers.questions import in_a_row
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
@@ -153,18 +153,6 @@ def test_overflow_is_told(device, packs, output, keeps):
     refused(ab.CapacityError, rf"Buffers\(pairs={len(scene.broad_phase())}\)", short.check)
 
 
-def test_uncertain_face_pairs_are_counted_on_the_device(device, packs):
-    scene = add_objects(device)
-    whole = GpuQuery(scene, "faces", pairs=MORE_PAIRS).run()
-    demand = whole.float64_tests.sum()
-    query = GpuQuery(scene, "faces", pairs=MORE_PAIRS, capacity=ab.Buffers(uncertain=1))
-    query.launch()
-    for keeps in (False, True):
-        with pytest.raises(ab.CapacityError, match=rf"Buffers\(uncertain={demand}\)"):
-            query.result(device=keeps).check()
-    assert describe(query.run()) == describe(whole)
-
-
 @pytest.mark.parametrize("keeps", [False, True], ids=["host", "device"])
 def test_without_a_launch_there_is_no_result(device, packs, keeps):
     query = ab.Query(add_objects(device), "faces", pairs=MORE_PAIRS)
@@ -216,14 +204,6 @@ def test_calls_that_repeat_follow_what_changes(device, output):
             assert describe(found) == describe(make_query(scene, output.split()[0], pairs, within=within).run())
             seen.add(tuple(describe(found)))
     assert len(seen) > 3, "nothing has changed"
-
-
-@pytest.mark.parametrize("bits", [63, 20])
-def test_two_passes_sort_on_the_device(device, bits):
-    scene = add_objects(device)
-    expected = scene.intersect(MORE_PAIRS, "faces").faces
-    with testing.regime(key_bits=bits, packs_results=True):
-        np.testing.assert_array_equal(ab.Query(scene, "faces", pairs=MORE_PAIRS).run().faces, expected)
 
 
 def test_points_stay_on_the_device(device):
