@@ -318,20 +318,6 @@ def test_a_graph_answers_what_is_in_place(device, warps):
             assert to_bytes(called.run()) == to_bytes(expected)
             met.append(expected.any.mean())
     assert 0.2 < np.mean(met) < 0.8
-
-
-def test_graphs_captured_first_and_stale_ones(device):
-    """The first launch may be that of a graph; one whose tree states were replaced is refused, a new one is not."""
-    rng = np.random.default_rng(14)
-    cases = [random_case(rng, ("torus", "ball"), 60) for _ in range(4)]
-    scene, pairs = scene_of(device, cases), pairs_of(cases)
-    query = ab.DistanceQuery(scene, pairs)
-    for turn in range(2):
-        replay = captured(query)
-        for _ in range(3):
-            replay()
-        assert to_bytes(query.result()) == to_bytes(ab.DistanceQuery(scene, pairs).run())
-        scene.set_lods([model.lod_max - 5 * i - 7 * turn for i, model in enumerate(scene.models * 4)])
-        replay()
-        if turn == 0:
-            refused(RuntimeError, "captured before arrays that it uses were replaced", query.result)
+    scene.set_lods(np.maximum(scene.lods - np.arange(scene.object_count) % 5, 0))  # more states than there were
+    replay()
+    refused(RuntimeError, "captured before arrays that it uses were replaced", first.result)

@@ -54,38 +54,12 @@ def sheets(rng, roughness, far, bend, side=9):
     return models, poses
 
 
-def anchored_sheets(rng, roughness, far, aside):
-    """Return two flat sheets, each with a face far behind it, so that centres lie far from them, and poses.
-
-    Args:
-        aside: How far the poses are aside; 0 puts faces of the same number right over one another.
-    """
-    vertices, faces = grid(9)
-    models, poses = [], []
-    for side, height in ((-1, 0.0), (1, 0.25)):
-        points = vertices / 9 + roughness * rng.normal(size=vertices.shape) * [0, 0, 1]
-        behind = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]) + [0, 0, side * far * rng.uniform(0.5, 1)]
-        corners = np.concatenate([points, behind])
-        count = len(points)
-        models.append(ab.Model.from_arrays(corners, [*faces, [count, count + 1, count + 2]], base_faces=200))
-        poses.append(np.array([*(aside * rng.normal(size=2)), height, 0, 0, 0, 1]))
-    return models, poses
-
-
 @pytest.mark.parametrize("roughness", [*slow(1e-6), 1e-8, 1e-10])
 @pytest.mark.parametrize("far", [0.0, 100.0])
 @pytest.mark.parametrize("bend", [0.0, 0.3])
 def test_nearly_equally_near_faces(device, roughness, far, bend):
     rng = np.random.default_rng(1)
     check_sheets(device, [sheets(rng, roughness, far, bend) for _ in range(2)], 1 + far)
-
-
-@pytest.mark.parametrize("roughness", [*slow(1e-6), 1e-8])
-@pytest.mark.parametrize("far", [3.0, 100.0])
-@pytest.mark.parametrize("aside", [0.1, 0.0])
-def test_nearly_equally_near_faces_of_large_objects(device, roughness, far, aside):
-    rng = np.random.default_rng(3)
-    check_sheets(device, [anchored_sheets(rng, roughness, far, aside) for _ in range(4)], 1 + far)
 
 
 def check_sheets(device, sheets, size):

@@ -141,24 +141,6 @@ def test_results_on_the_device(device, originals):
         host.check()
 
 
-def test_sweeps(device):
-    a, b = sample("cow"), sample("torus")
-    poses = random_poses(np.random.default_rng(7), 300, 3.0)
-    truth = ab.sweep(a, b, poses, output="distance", device=device)
-    asked = {"output": "distance", "device": device, "originals": True}
-    lods = {"lod_a": a.lod_for(fraction=0.2), "lod_b": b.lod_for(fraction=0.2)}
-    for _ in range(2):
-        for options in ({}, {"relative": 0.3}, {"tolerance": 0.2}, {"beyond": 0.7, "relative": 0.5}):
-            found = ab.sweep(a, b, poses, **asked, **lods, **options)
-            lower, upper = found["bracket"].T
-            assert (lower <= truth["distance"] * CLOSE).all() and (truth["distance"] <= upper * CLOSE).all()
-            np.testing.assert_array_equal(found["distance"] == 0, truth["distance"] == 0)
-            beyond = options.get("beyond", np.inf)
-            np.testing.assert_array_equal(np.isinf(found["distance"]), truth["distance"] > beyond)
-            if not options:
-                np.testing.assert_array_equal(found, truth)
-
-
 def test_solids(device):
     cow, ball = sample("cow"), sample("ball")
     small = ab.Model.from_arrays(ball.mesh_at(ball.lod_max)[0] / 9, ball.mesh_at(ball.lod_max)[1])
