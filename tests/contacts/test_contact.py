@@ -68,7 +68,7 @@ def test_ends_and_normals_equal_exact_clipping(device, case):
     rows = result.contacts
     assert len(rows) > 10
     check_fields(result)
-    for row in rows[np.random.default_rng(0).permutation(len(rows))[:120]]:
+    for row in rows[np.random.default_rng(0).permutation(len(rows))[:60]]:
         a = triangles(models[0], row["faces"][0])
         b = into_frame_of_a(triangles(models[1], row["faces"][1]), STILL, pose)
         polygon = shared_polygon(a, b)
@@ -90,7 +90,8 @@ def check_fields(result):
     """Every hit once and in order, no NaN, unit normals as defined, the sum over each pair as defined."""
     rows = result.contacts
     np.testing.assert_array_equal(np.column_stack([rows["pair"], rows["faces"]]), result.faces)
-    assert rows["pair"].dtype == np.int32 and rows["coplanar"].dtype == bool
+    assert rows.dtype.names == ("pair", "faces", *VECTORS, "coplanar") and rows["coplanar"].dtype == bool
+    assert rows["pair"].dtype == np.int32 and not (rows.dtype.hasobject or result.pair_contacts.dtype.hasobject)
     for name in VECTORS:
         assert rows[name].shape == (len(rows), 3) and rows[name].dtype == np.float64 and np.isfinite(rows[name]).all()
     np.testing.assert_allclose(np.linalg.norm(rows["normal"], axis=1), 1.0, atol=1e-15)
@@ -136,17 +137,6 @@ def test_batches_in_the_world(device, names):
     for name, sign in (("point", 1), ("normal", -1)):
         before = result.pair_contacts[name][some]
         np.testing.assert_allclose(swapped.pair_contacts[name][some], sign * before, rtol=1e-6, atol=1e-9)
-
-
-def test_contacts_need_no_pickle(device, tmp_path):
-    result = contacts_of(device, (sample("ball"), STILL), (sample("torus"), CASES["flat"][2]), pairs=[(1, 0)])
-    assert len(result.contacts) > 10
-    assert result.contacts.dtype.names == ("pair", "faces", *VECTORS, "coplanar")
-    np.savez(tmp_path / "some.npz", contacts=result.contacts, pair_contacts=result.pair_contacts)
-    with np.load(tmp_path / "some.npz", allow_pickle=False) as file:
-        assert file["contacts"].dtype == result.contacts.dtype
-        for name in ("contacts", "pair_contacts"):
-            assert file[name].tobytes() == getattr(result, name).tobytes()
 
 
 @pytest.mark.parametrize("gap", [None, 0.1])

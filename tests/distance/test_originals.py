@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import warp as wp
-from helpers import refused
 from helpers.questions import pairs_of, random_lod, scene_of
 from helpers.samples import STILL, grid, random_poses, sample
 from helpers.scenes import scene_with
@@ -93,31 +92,6 @@ def make_spike():
     return ab.Model.from_arrays((vertices - [4, 4, 0]) / 8, faces, base_faces=2)
 
 
-def test_what_lods_lack_counts_to_the_last(device):
-    """A spike that its LOD lacks reaches out by 0.98 of the certified error, towards a plate."""
-    spike = make_spike()
-    plate = ab.Model.from_arrays(grid(1)[0] - [0.5, 0.5, 0], grid(1)[1], base_faces=2)
-    cases = [(spike, 0, (0, 0, 0, 0, 0, 0, 1), plate, 0, (0, 0, 1, 0, 0, 0, 1))]
-    error = spike.error_at(0)
-    assert 0.98 * error < scene_of(device, cases).intersect([(0, 1)], "distance").distance[0] - 0.8 < error
-    for beyond, distance in ((0.801, 0.8), (0.79, np.inf), (0.8 - 0.02 * error, np.inf)):
-        asked = {"beyond": beyond, "relative": 0.5, "originals": True}
-        found = scene_of(device, cases).intersect([(0, 1)], "distance", **asked)
-        assert found.distance[0] == pytest.approx(distance)
-
-
-def test_errors_of_both_count(device):
-    """Two spikes that their LODs lack reach towards one another."""
-    spike = make_spike()
-    scene, error = scene_with(device, spike, (spike, (0, 0, 1.5, 1, 0, 0, 0)), lod=0), spike.error_at(0)
-    distance = 1.1
-    for beyond, finds in ((distance * CLOSE, True), (distance / CLOSE, False), (distance - 0.041 * error, False)):
-        for pairs in ([[0, 1]], [[1, 0]]):
-            result = scene.intersect(pairs, "distance", beyond=beyond, originals=True)
-            check(result, np.array([distance]), beyond=beyond)
-            assert np.isfinite(result.distance[0]) == finds
-
-
 def test_without_tolerance_the_answer_is_that_of_the_finest(device):
     cases = random_cases(np.random.default_rng(2), 20)
     expected = scene_of(device, finest(cases)).intersect(pairs_of(cases), "distance")
@@ -151,17 +125,6 @@ def test_poses_lods_and_objects_change(device):
     check(result, reference.intersect(pairs, "distance").distance, **options)
 
 
-def test_distances_of_their_own_for_each_pair(device):
-    cases = random_cases(np.random.default_rng(5), 12)
-    truth = scene_of(device, finest(cases)).intersect(pairs_of(cases), "distance").distance
-    beyond = truth * np.where(np.arange(12) % 2, 0.8, 1.2)
-    scene = scene_of(device, cases)
-    options = {"beyond": beyond, "relative": 0.5}
-    check(scene.intersect(pairs_of(cases), "distance", originals=True, **options), truth, **options)
-    found = scene.intersect(output="distance", originals=True)
-    assert set(map(tuple, scene.broad_phase().tolist())) <= set(map(tuple, found.pairs.tolist()))
-
-
 @pytest.mark.parametrize("originals", [False, True])
 def test_results_on_the_device(device, originals):
     cases = random_cases(np.random.default_rng(6), 10)
@@ -176,24 +139,6 @@ def test_results_on_the_device(device, originals):
             np.testing.assert_array_equal(getattr(kept, name).numpy(), getattr(host, name))
             assert getattr(kept, name).device == scene_of(device, cases).device
         host.check()
-
-
-def test_sweeps(device):
-    a, b = sample("cow"), sample("torus")
-    poses = random_poses(np.random.default_rng(7), 300, 3.0)
-    truth = ab.sweep(a, b, poses, output="distance", device=device)
-    asked = {"output": "distance", "device": device, "originals": True}
-    lods = {"lod_a": a.lod_for(fraction=0.2), "lod_b": b.lod_for(fraction=0.2)}
-    for _ in range(2):
-        for options in ({}, {"relative": 0.3}, {"tolerance": 0.2}, {"beyond": 0.7, "relative": 0.5}):
-            found = ab.sweep(a, b, poses, **asked, **lods, **options)
-            lower, upper = found["bracket"].T
-            assert (lower <= truth["distance"] * CLOSE).all() and (truth["distance"] <= upper * CLOSE).all()
-            np.testing.assert_array_equal(found["distance"] == 0, truth["distance"] == 0)
-            beyond = options.get("beyond", np.inf)
-            np.testing.assert_array_equal(np.isinf(found["distance"]), truth["distance"] > beyond)
-            if not options:
-                np.testing.assert_array_equal(found, truth)
 
 
 def test_solids(device):
@@ -211,19 +156,6 @@ def test_solids(device):
     lower, upper = found.bracket.T
     truth = scene.intersect(pairs, "distance").distance
     assert (lower <= truth).all() and (truth <= upper).all()
-
-
-def test_bad_input(device):
-    scene = scene_of(device, random_cases(np.random.default_rng(9), 1))
-    pairs = [(0, 1)]
-    for options in ({"tolerance": -1}, {"relative": 1.0}, {"beyond": np.nan}, {"originals": 1}, {"originals": "yes"}):
-        refused(ValueError, next(iter(options)), scene.intersect, pairs, "distance", **{"originals": True, **options})
-    refused(ValueError, "originals means nothing for output 'any'", scene.intersect, pairs, originals=True)
-    refused(ValueError, "within means nothing", scene.intersect, pairs, "distance", originals=True, within=1.0)
-    refused(ValueError, "pairs object 0 with itself", scene.intersect, [(0, 0)], "distance", originals=True)
-    given = scene.models[0], scene.models[0], [STILL]
-    refused(ValueError, "originals", ab.sweep, *given, output="distance", device=device, originals="no")
-    refused(ValueError, "originals means nothing", ab.sweep, *given, device=device, originals=True)
 
 
 def test_the_broad_phase_finds_what_lods_leave_out(device):

@@ -81,15 +81,14 @@ def apart(pairs):
     return pairs[~pairs_intersect(points, index[:, 0], points, index[:, 1], np.stack([rows, rows], 1))]
 
 
-def check(device, kind, count, seed):
-    """Compare with the truth; return the largest error, in what is allowed."""
-    pairs = apart(make_pairs(kind, np.random.default_rng(seed), count))
-    assert len(pairs) > count // 8
+@pytest.mark.parametrize("kind", KINDS)
+def test_equals_integers(device, kind):
+    pairs = apart(make_pairs(kind, np.random.default_rng(1), 800))
+    assert len(pairs) > 100
     distances, weights = measure(device, pairs)
     truth = np.array([true_distance(a, b) for a, b in pairs])
     size = np.abs(pairs[:, :, :, None] - pairs[:, :1, :1, None]).max((1, 2, 3, 4))
-    error = np.abs(distances - truth) / size
-    assert error.max() < ROUNDING
+    assert (np.abs(distances - truth) / size).max() < ROUNDING
     assert ((weights >= -(2.0**-52)) & (weights <= 1)).all()
     np.testing.assert_allclose(weights.sum(2), 1, rtol=0, atol=2.0**-51)
     points = np.einsum("npk,npkx->npx", weights, pairs)
@@ -98,27 +97,6 @@ def check(device, kind, count, seed):
     assert (np.abs(between - distances) <= 2.0**-49 * reach).all()
     swapped, _ = measure(device, pairs[:, ::-1])
     assert (np.abs(swapped - distances) / size).max() < ROUNDING
-    return error.max() / ROUNDING
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_equals_integers(device, kind):
-    check(device, kind, 400, 1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_equals_integers_for_very_many(device, kind):
-    print(kind, check(device, kind, 12_000, 2))
-
-
-@pytest.mark.parametrize("exponent", [-290, -60, 200])
-def test_powers_of_two_change_nothing(device, exponent):
-    pairs = apart(make_pairs("random", np.random.default_rng(3), 200))
-    distances, weights = measure(device, pairs)
-    scaled, scaled_weights = measure(device, np.ldexp(pairs, exponent))
-    np.testing.assert_array_equal(scaled, np.ldexp(distances, exponent))
-    np.testing.assert_array_equal(scaled_weights, weights)
 
 
 def test_oracle_knows_distances():

@@ -77,13 +77,12 @@ REGIMES = {
 }
 
 
-@pytest.mark.parametrize("make_query", [ab.Query, GpuQuery], ids=["threads", "as on CUDA"])
 @pytest.mark.parametrize("speck_first", [True, False], ids=["speck first", "speck second"])
 @pytest.mark.parametrize("regime", REGIMES)
 @pytest.mark.slow
-def test_faces_that_touch_are_never_missed(device, regime, speck_first, make_query):
+def test_faces_that_touch_are_never_missed(device, regime, speck_first):
     rng = np.random.default_rng([11, list(REGIMES).index(regime)])
-    cases = [touching_pair(rng, *REGIMES[regime], speck_first) for _ in range(150)]
+    cases = [touching_pair(rng, *REGIMES[regime], speck_first) for _ in range(80)]
     for a, pose_a, b, pose_b in cases:
         assert triangles_intersect(a, into_frame_of_a(b, pose_a, pose_b))
     models = [[ab.Model.from_arrays(corners, FACE) for corners in (a, b)] for a, _, b, _ in cases]
@@ -92,7 +91,8 @@ def test_faces_that_touch_are_never_missed(device, regime, speck_first, make_que
     objects = scene.batch().objects.pool  # past the scene's check, as they may be skewed
     objects.rotation.assign(np.ascontiguousarray(poses[:, :3, :3]))
     objects.position.assign(np.ascontiguousarray(poses[:, :3, 3]))
-    assert make_query(scene, "any", pairs=pairs_of(cases)).run().any.all()
+    for make_query in (ab.Query, GpuQuery):
+        assert make_query(scene, "any", pairs=pairs_of(cases)).run().any.all()
 
 
 def mirrored(corners):

@@ -30,20 +30,26 @@ AT_ONCE = 100  # leaf pairs that a test waits for
 
 
 @pytest.mark.parametrize("gap", [0.001, 0.02, 0.06])
-def test_nested_parts_equal_brute_force(gap):
+def test_nested_parts_equal_brute_force(device, gap):
+    """With slabs of subtrees on the CPU, and of nodes of few faces where warps compare, as with boxes alone."""
     cases = nested_cases(np.random.default_rng(5), gap)
     truth = [true_faces(*case) for case in cases]
     rows = np.concatenate([np.insert(faces, 0, p, 1) for p, faces in enumerate(truth)])
-    tests = {}
-    for plain_tests in (0, 1000, 10**9):
-        with testing.regime(plain_tests=plain_tests):
-            scene = scene_of(CPU, cases)
+    regimes = [{"warps": True, "warps_per_pair": 1, "slabs": slabs} for slabs in (True, False)]
+    regimes += [{"plain_tests": count} for count in (0, 1000, 10**9)] if device == CPU else []
+    tests = []
+    for regime in regimes:
+        with testing.regime(**regime):
+            scene = scene_of(device, cases)
             found = scene.intersect(pairs_of(cases), "faces")
-            np.testing.assert_array_equal(found.faces, rows)
             met = scene.intersect(pairs_of(cases), "any").any
-            np.testing.assert_array_equal(met, [len(faces) > 0 for faces in truth])
-            tests[plain_tests] = found.node_tests.sum(), found.triangle_tests.sum()
-    assert (1.3 * np.array(tests[0]) < tests[10**9]).all(), "slabs separate what boxes do not"
+        np.testing.assert_array_equal(found.faces, rows)
+        np.testing.assert_array_equal(met, [len(faces) > 0 for faces in truth])
+        tests.append(np.stack([found.node_tests, found.triangle_tests], 1))
+    with_slabs, plain, *on_cpu = tests
+    np.testing.assert_array_equal(with_slabs[1], plain[1], "no slabs at coarse LODs")
+    assert 1.03 * with_slabs[0, 1] < plain[0, 1], "slabs separate what boxes do not"
+    assert not on_cpu or (1.3 * on_cpu[0].sum(0) < on_cpu[2].sum(0)).all()
 
 
 def test_many_subtrees_share_little_memory(monkeypatch):

@@ -5,13 +5,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import warp as wp
-from helpers.nested import nested_cases
-from helpers.questions import GpuQuery, pairs_of, scene_of, to_matrix
-from helpers.samples import random_quaternions, sample, true_faces
+from helpers.questions import GpuQuery, to_matrix
+from helpers.samples import random_quaternions, sample
 from oracles.triangle import into_frame_of_a, quaternion_matrix
 
 import warp_abtree as ab
-from warp_abtree import testing
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import SLAB_DEPTH, PairBatch
@@ -53,24 +51,6 @@ def test_slabs_hold_their_faces(device, name):
                 assert abs(along - Fraction(float(sums[node]))) <= Fraction(float(sizes[node])) + rounding
             node >>= 1
     assert np.median(sizes[leaf_node[used]]) < 1e-3 * int(DIRECTION_LENGTH) * reach
-
-
-@pytest.mark.parametrize("gap", [0.001, 0.02, 0.06])
-def test_nested_parts_equal_brute_force(device, gap):
-    cases = nested_cases(np.random.default_rng(5), gap)
-    rows = np.concatenate([np.insert(true_faces(*case), 0, p, 1) for p, case in enumerate(cases)])
-    tests = []
-    for slabs in (False, True):
-        with testing.regime(slabs=slabs, warps_per_pair=1):
-            scene = scene_of(device, cases)
-            found = GpuQuery(scene, "faces", pairs=pairs_of(cases)).run()
-            np.testing.assert_array_equal(found.faces, rows)
-            met = GpuQuery(scene, "any", pairs=pairs_of(cases)).run().any
-            np.testing.assert_array_equal(met, np.isin(range(len(cases)), rows[:, 0]))
-            tests.append((found.node_tests, found.triangle_tests))
-    (nodes, faces), (fewer_nodes, fewer_faces) = tests
-    assert nodes[1] == fewer_nodes[1] and faces[1] == fewer_faces[1], "no slabs at coarse LODs"
-    assert 1.03 * fewer_faces[0] < faces[0], "slabs separate what boxes do not"
 
 
 @wp.kernel

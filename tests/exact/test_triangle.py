@@ -79,14 +79,14 @@ def collinear(lines, rng, count):
 
 # Determinants of these small integers are exact in float64, so no answer may differ; generic ones are never so near.
 KINDS = {
-    "generic": (generic, 40_000),
-    "lattice of 2": (partial(lattice, 2), 20_000),
-    "lattice of 3": (partial(lattice, 3), 40_000),
-    "lattice of 6": (partial(lattice, 6), 30_000),
-    "in one plane": (in_plane, 30_000),
-    "touching": (touching, 30_000),
-    "collinear": (partial(collinear, 2), 30_000),
-    "on one line": (partial(collinear, 1), 10_000),
+    "generic": (generic, 20_000),
+    "lattice of 2": (partial(lattice, 2), 10_000),
+    "lattice of 3": (partial(lattice, 3), 20_000),
+    "lattice of 6": (partial(lattice, 6), 15_000),
+    "in one plane": (in_plane, 15_000),
+    "touching": (touching, 15_000),
+    "collinear": (partial(collinear, 2), 15_000),
+    "on one line": (partial(collinear, 1), 5_000),
 }
 
 
@@ -103,26 +103,3 @@ def test_answers_are_exact(device, kind):
     scale = rng.choice([0, -280, -100, -30, 30, 100, 280], (count, 1, 1, 1))
     wrong = pairs[meet(np.ldexp(pairs, scale), device) != expected]
     assert len(wrong) == 0, f"{len(wrong)} wrong, first: {wrong[0].tolist()}"
-
-
-def test_certain_answers_survive_rounding(device):
-    """A float64 determinant may lie about triangles that almost touch, but not about those it can prove apart."""
-    rng = np.random.default_rng(4)
-    pairs = touching(rng, 30_000) / 7.0 + rng.normal(size=(30_000, 1, 1, 3))
-    pairs[:, 1] += rng.choice([0.0, 1e-15, 1e-12, 1e-6], (30_000, 1, 1)) * rng.normal(size=(30_000, 1, 3))
-    apart = oracle.provably_apart(pairs[:, 0], pairs[:, 1])
-    answers = meet(pairs, device)
-    assert 1000 < apart.sum() < 29_000
-    assert not answers[apart].any()
-    assert (answers == truth(pairs)).mean() > 0.8
-
-
-def test_a_triangle_meets_itself_and_its_neighbours(device):
-    """Shared corners cancel exactly, so faces of one mesh that share a vertex always meet, whatever the coordinates."""
-    rng = np.random.default_rng(5)
-    pairs = rng.normal(size=(20_000, 2, 3, 3)) * 2.0 ** rng.integers(-20, 20, (20_000, 1, 1, 1))
-    shared = np.arange(3) < rng.integers(1, 4, (20_000, 1))
-    pairs[:, 1] = np.where(shared[:, :, None], pairs[:, 0], pairs[:, 1])
-    order = rng.permuted(np.tile(np.arange(3), (20_000, 1)), axis=1)
-    pairs[:, 1] = np.take_along_axis(pairs[:, 1], order[:, :, None], 1)
-    assert meet(pairs, device).all()

@@ -19,7 +19,6 @@ from warp_abtree.app import SceneError, load_scene
 from warp_abtree.app.cli.main import main
 from warp_abtree.model.mesh import describe_mesh, mesh_from_arrays, orient_mesh
 from warp_abtree.model.winding import find_winding
-from warp_abtree.simulate.body_state import mass_properties
 
 BALL = trimesh.creation.icosphere(1)
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
@@ -38,12 +37,6 @@ def joined(*parts):
     """Return one mesh of parts, and the part of each face."""
     vertices, faces = trimesh.util.append_faces(*zip(*parts))
     return vertices, faces, np.repeat(np.arange(len(parts)), [len(part[1]) for part in parts])
-
-
-def mirrored(part, k):
-    """Return a part of height 1 with its lower side at k, every other one upside down."""
-    vertices, faces = part
-    return (vertices * [1, 1, -1] + [0, 0, k + 1], faces[:, ::-1]) if k % 2 else (vertices + [0, 0, k], faces)
 
 
 TETRAHEDRON = CORNERS[[0, 3, 5, 6]], np.array([(0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2)])
@@ -85,9 +78,9 @@ def test_parity_decides_which_way_parts_face(name):
     part = find_winding(welded.vertices, welded.faces).part if part is None else part
     rng = np.random.default_rng(list(SHELLS).index(name))
     # Beside faces of all parts, on either side.
-    points = vertices[faces[rng.choice(len(faces), 40)]].mean(1) + rng.normal(size=(40, 3)) * 0.05
+    points = vertices[faces[rng.choice(len(faces), 24)]].mean(1) + rng.normal(size=(24, 3)) * 0.05
     truth = winding_numbers(welded, points) % 2
-    assert 5 < truth.sum() < 35
+    assert 3 < truth.sum() < 21
     for case in range(4):
         # Whole parts either way, as they are given; then with some faces of their own besides.
         mesh = mesh_from_arrays(vertices, some_turned(rng, faces, part, case > 1))
@@ -134,37 +127,6 @@ def volume(vertices, faces):
         (ax, ay, az), (bx, by, bz), (cx, cy, cz) = ([Fraction(x) for x in corner] for corner in (a, b, c))
         total += ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
     return total
-
-
-@pytest.mark.parametrize("scale, at", [(2.0**-90, 0.0), (2.0**90, 0.0), (1.0, 1e6)])
-def test_sizes_and_places_do_not_matter(scale, at):
-    vertices, faces, part = joined(ball(3), ball(2), ball(1))
-    mended = orient_mesh(mesh_from_arrays(vertices * scale + at, faces))
-    same = (mended.faces == mesh_from_arrays(vertices, faces).faces).all(1)
-    np.testing.assert_array_equal(same, part != 1)
-
-
-TOUCHING = {
-    "a row of boxes, walls cut otherwise": (joined(*[box(1, (k, 0, 0)) for k in range(3)]), 3),
-    "a stack, walls cut alike": (joined(*[mirrored(box(1), k) for k in range(3)]), 3),
-    "two cavities with a wall between in a box": (joined(box(5), box(1, (1, 2, 2)), box(1, (2, 2, 2))), 125 - 2),
-    "eight, with a cavity each": (
-        joined(*[box(1, at) for at in CORNERS], *[(TETRAHEDRON[0] / 4 + at + 0.25, TETRAHEDRON[1]) for at in CORNERS]),
-        8 - Fraction(8, 3 * 64),
-    ),
-}
-
-
-@pytest.mark.parametrize("name", TOUCHING)
-def test_bodies_that_share_a_wall_face_out(name):
-    """Their edges at the wall have four faces; a cavity's and another's sides end there alike."""
-    (vertices, faces, part), material = TOUCHING[name]
-    rng = np.random.default_rng(list(TOUCHING).index(name))
-    for case in range(6):
-        mended = orient_mesh(mesh_from_arrays(vertices, some_turned(rng, faces, part, case > 2)))
-        assert volume(mended.vertices, mended.faces) == 6 * material
-        assert describe_mesh(mended)["winding"] == "outwards"
-    assert describe_mesh(mesh_from_arrays(vertices, turned(faces, part == 1)))["winding"] == "inside out"
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -224,7 +186,7 @@ def winding_of(vertices, faces):
     return find_winding(mesh.vertices, mesh.faces, mesh.dropped_faces)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(*[st.integers(0, 5)] * 3), min_size=1, max_size=20), st.integers(2, 6))
 def test_edges_are_counted_as_by_hand(faces, vertex_count):
     vertices = np.random.default_rng(0).normal(size=(6, 3))
@@ -361,11 +323,3 @@ def test_orient_in_models_files_and_commands(tmp_path, capsys, monkeypatch):
     trimesh.Trimesh(ball.vertices, ball.faces[1:]).export("torn.obj")
     torn = write_scene(tmp_path, text.replace("ball.obj", "torn.obj"))
     refused(SceneError, r"objects\[0\].solid: .* is no solid.*edges belong", load_scene, torn, device="cpu")
-
-
-def test_the_mass_of_a_mended_body_is_its_own():
-    inverted = ab.Model.from_arrays(TORUS.vertices, TORUS.faces[:, ::-1], name="inverted")
-    with pytest.warns(RuntimeWarning, match="mass"):
-        assert mass_properties(inverted).volume > 1.2 * TORUS.volume  # of the hull
-    mended = ab.Model.from_arrays(TORUS.vertices, TORUS.faces[:, ::-1], orient=True)
-    assert mass_properties(mended).volume == pytest.approx(TORUS.volume)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from helpers import refused
 from helpers.questions import launch
 from helpers.samples import random_poses
 from helpers.scenes import scene_with
@@ -42,7 +41,7 @@ def parity_kernel(points: wp.array[wp.vec3d], corners: wp.array2d[wp.vec3d], par
         parity_out[i, k] = count % 2
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_rays_through_corners_edges_and_faces(device, seed):
     """Points in line with corners and edges, and in the planes of faces; folded and doubled surfaces."""
     rng = np.random.default_rng(seed)
@@ -52,7 +51,7 @@ def test_rays_through_corners_edges_and_faces(device, seed):
         vertices = vertices * 2 + rng.integers(-2, 3, vertices.shape)
     triangles = vertices[faces]
     # In the middle of cells, at the height of corners, on lines through edges: never on the surface.
-    grid = rng.integers(-2, 18, (200, 3)) * 0.5
+    grid = rng.integers(-2, 18, (100, 3)) * 0.5
     middles = (triangles[:, 0] + triangles[:, 1]) / 2 + rng.integers(-1, 2, (len(faces), 3)) * 0.25
     points = np.concatenate([grid, middles, vertices + np.eye(3)[rng.integers(0, 3, len(vertices))] * 0.5])
     if seed == 2:
@@ -67,11 +66,11 @@ def test_rays_through_corners_edges_and_faces(device, seed):
         except AssertionError:
             continue
     found = launch(parity_kernel, device, len(kept), np.array(kept), triangles, columns=6)
-    assert len(kept) > 250 and 20 < sum(expected) < len(kept)
+    assert len(kept) > 150 and 20 < sum(expected) < len(kept)
     np.testing.assert_array_equal(found, np.repeat(np.array(expected, int)[:, None], 6, axis=1))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_lattice_solids_are_decided_as_in_integers(seed):
     """Voxel bodies with cavities and bodies within them, in lattice poses: every ray is degenerate."""
@@ -96,7 +95,7 @@ def test_lattice_solids_are_decided_as_in_integers(seed):
             assert (found.distance[0] == 0) == (meet or held)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_solids_at_every_lod_and_random_poses(device, seed):
     """Coarse meshes that fold and cross themselves have an inside too."""
     rng = np.random.default_rng(seed)
@@ -207,19 +206,6 @@ def test_nothing_is_made_without_solids(device):
     assert scene.batch().solids is not None
 
 
-def test_sweeps_know_solids(device):
-    poses = np.array([moved(x) for x in (0.0, 1.0, 1.75, 2.6, 0.3)])
-    plain = ab.sweep(BOX, BALL, poses, device=device)
-    np.testing.assert_array_equal(plain, [False, False, True, False, False])
-    for solid in (True, (True, False)):
-        np.testing.assert_array_equal(ab.sweep(BOX, BALL, poses, device=device, solid=solid), [1, 1, 1, 0, 1])
-        found = ab.sweep(BOX, BALL, poses, device=device, solid=solid, output="distance")
-        np.testing.assert_array_equal(found["distance"] == 0, [1, 1, 1, 0, 1])
-    np.testing.assert_array_equal(ab.sweep(BOX, BALL, poses, device=device, solid=(False, True)), plain)
-    np.testing.assert_array_equal(ab.sweep(BOX, BALL, poses, device=device, solid=True, output="count") > 0, plain)
-    refused(ValueError, "solid", ab.sweep, BOX, BALL, poses, device=device, solid="yes")
-
-
 def test_captured_queries_and_pipelines_see_new_lods_and_poses(device):
     if device != "cpu" and not wp.is_mempool_enabled(device):
         pytest.skip("capturing needs memory pools")
@@ -264,7 +250,7 @@ def test_real_meshes_against_winding_numbers(device, name, real_mesh_path):
     vertices = mesh.mesh_at(mesh.lod_max)[0]
     lower, upper = vertices.min(0), vertices.max(0)
     probe = ab.Model.load(trimesh.creation.icosphere(0, 0.004 * np.ptp(vertices, axis=0).max()), base_faces=20)
-    poses = random_poses(rng, 250, 1.0)
+    poses = random_poses(rng, 150, 1.0)
     poses[:, :3] = rng.uniform(lower, upper, (len(poses), 3))
     for lod in (mesh.lod_max, mesh.lod_for(fraction=0.05)):
         faces = mesh.mesh_at(lod)[0][mesh.mesh_at(lod)[1]]

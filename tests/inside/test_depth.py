@@ -1,5 +1,7 @@
 """Depth and contact points of solids: the deepest samples inside, by brute force, closed forms, and ways out."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import trimesh
@@ -101,13 +103,6 @@ def test_closed_forms(device):
     assert ask(device, [(BOX, moved(), True), (BOX, moved(), True)], **DEPTH).distance[0] == 0
 
 
-def test_a_single_face(device):
-    sheet = ab.Model.from_arrays([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    both = [(BOX, moved(), True), (sheet, moved(1.5), False)]
-    for placed in (both, both[::-1]):
-        assert ask(device, placed, **DEPTH).distance[0] == pytest.approx(-0.5, abs=1e-12)
-
-
 def test_in_a_cavity_distances_stay_positive(device):
     hollow = model_of(voxel_mesh(shell(5)), "hollow")
     found = ask(device, [(hollow, moved(), True), (BALL, moved(2.5, 2.5, 2.5), True)], **DEPTH)
@@ -170,35 +165,26 @@ def test_sweeps_and_captured_queries(device):
         assert query.result().distance[0] == found["distance"][k]
 
 
-def signed_anyhow(scene, pairs):
-    """Yield every way to ask a scene for the depths of pairs, None for those of the broad phase."""
-    yield lambda: scene.intersect(pairs, "distance", signed=True)
-    yield lambda: ab.DistanceQuery(scene, pairs, signed=True).run()
-    if pairs is not None:
-        others = ab.DistanceQuery(scene, np.array([(0, 3)]), signed=True) if any(scene.object_solid) else None
-        yield lambda: others.set_pairs(pairs) if others is not None else ab.DistanceQuery(scene, pairs, signed=True)
-
-
+@pytest.mark.parametrize("with_solid", [False, True])
 @pytest.mark.parametrize("pairs", [None, [(0, 1)], [(0, 1), (2, 1)], []], ids=str)
-def test_depths_of_surfaces_are_refused(device, pairs):
-    """Three surfaces, beside which a solid stands or does not."""
-    given = None if pairs is None else np.array(pairs, np.int32).reshape(-1, 2)
-    for with_solid in (False, True):
-        scene = scene_with(device, *[(BALL, moved(x)) for x in (0.0, 1.0, 1.5)])
-        scene.add(BOX, moved(50.0), solid=with_solid)
-        # Of no pair at all nothing is wrong; nor of what the broad phase happens to find in a scene with a solid.
-        fine = with_solid and not pairs
-        for ask_it in signed_anyhow(scene, given):
-            if fine:
-                ask_it()
-                continue
+def test_depths_of_surfaces_are_refused(device, pairs, with_solid):
+    """Of three surfaces, beside which a solid stands or does not."""
+    beside = BOX, moved(50.0), {"solid": with_solid}
+    scene = scene_with(device, *[(BALL, moved(x)) for x in (0.0, 1.0, 1.5)], beside)
+    asks = [partial(scene.intersect, pairs, "distance", signed=True)]
+    asks.append(lambda: ab.DistanceQuery(scene, pairs, signed=True).run())
+    if pairs is not None and with_solid:
+        asks.append(partial(ab.DistanceQuery(scene, [(0, 3)], signed=True).set_pairs, pairs))
+    # Of no pair at all nothing is wrong; nor of what the broad phase happens to find in a scene with a solid.
+    for ask_it in asks:
+        if with_solid and not pairs:
+            ask_it()
+        else:
             refused(ValueError, r"^signed: no object of the pairs is a solid", ask_it)
-        found = scene.intersect(given, "distance")
-        if fine:
-            np.testing.assert_array_equal(scene.intersect(given, "distance", signed=True).distance, found.distance)
-    mixed = scene.intersect([(0, 1), (0, 3)], "distance", signed=True)
-    np.testing.assert_array_equal(mixed.distance, scene.intersect([(0, 1), (0, 3)], "distance").distance)
-    refused(ValueError, "signed means nothing", scene.intersect, np.array([(0, 1)]), "any", signed=True)
+    refused(ValueError, "signed means nothing", scene.intersect, [(0, 1)], "any", signed=True)
+    if with_solid:
+        mixed, plain = (scene.intersect([(0, 1), (0, 3)], "distance", signed=signed) for signed in (True, False))
+        np.testing.assert_array_equal(mixed.distance, plain.distance)
 
 
 @pytest.mark.parametrize("count", [0, 3])

@@ -325,7 +325,7 @@ def test_no_vertex_lies_beyond_the_error():
     assert close > 10, "elsewhere no vertex decides the error"
 
 
-@pytest.mark.parametrize("slots", [0, 1, 8, 40])
+@pytest.mark.parametrize("slots", [0, 8])
 def test_covers_on_fewer_faces_than_they_want_are_measured_again(slots, monkeypatch):
     """Polygons that find no slot stand on a face that is used already, perhaps a far one, and the bound must say so."""
     mesh, looser = bumpy_sheet(8, 0.3, 1), 0

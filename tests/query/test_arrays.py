@@ -81,8 +81,9 @@ def poses_of(shape, real, count=4):
     return poses.astype(real)
 
 
-@pytest.mark.parametrize("real", [np.float32, np.float64])
-@pytest.mark.parametrize("shape", ["quaternions", "matrices"])
+@pytest.mark.parametrize(
+    ("shape", "real"), [("quaternions", np.float32), ("quaternions", np.float64), ("matrices", np.float32)]
+)
 def test_poses(device, framework, shape, real, monkeypatch):
     monkeypatch.setattr(pose_sweep, "CHUNKS", (64,))
     poses = poses_of(shape, real)
@@ -92,9 +93,9 @@ def test_poses(device, framework, shape, real, monkeypatch):
     for name in ("rotation", "position"):
         expected = getattr(first.batch().objects.pool, name).numpy()
         assert getattr(second.batch().objects.pool, name).numpy().tobytes() == expected.tobytes()
-    model, many = sample("torus"), poses_of(shape, real, 500)
+    model, many = sample("torus"), poses_of(shape, real, 200)
     scene = scene_with(device, *[(model, pose) for pose in (STILL, *many)])
-    expected = scene.intersect([(0, i + 1) for i in range(500)], output="faces")
+    expected = scene.intersect([(0, i + 1) for i in range(200)], output="faces")
     assert expected.any.any()
     for output in ("count", "faces"):
         found = ab.sweep(model, model, framework(many), output=output, device=device)

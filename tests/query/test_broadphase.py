@@ -98,7 +98,7 @@ objects = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(objects, st.lists(st.tuples(st.integers(0, 24), st.integers(0, 24)), max_size=8))
 def test_random_scenes_equal_brute_force(device, things, excluded):
     """Positions on a lattice, so that boxes often touch."""
@@ -114,20 +114,6 @@ def test_random_scenes_equal_brute_force(device, things, excluded):
     pipeline = ab.Pipeline(scene, output="any", capacity=ab.Buffers(pairs=400))
     pipeline.launch()
     np.testing.assert_array_equal(sort_rows(pipeline.result().pairs), pairs, "the pipeline's own objects")
-
-
-@pytest.mark.parametrize("far", [0.0, 3e7])
-def test_many_objects_after_moves_and_lods(device, far):
-    """Boxes in the world are float32: far from the origin they are coarser, never too small."""
-    rng = np.random.default_rng(1)
-    names, worlds, statics = rng.choice(NAMES, 600), rng.integers(-1, 3, 600), rng.random(600) < 0.3
-    poses = random_poses(rng, 600, 6.0) + far * np.array([-1, 0, 1, 0, 0, 0, 0])
-    scene = make_scene(device, names, poses, worlds, statics)
-    assert len(check_pairs(scene, poses, worlds, statics)) > 300
-    poses = random_poses(rng, 600, 4.0) + far * np.array([-1, 0, 1, 0, 0, 0, 0])
-    scene.set_poses(poses)
-    scene.set_lods([rng.integers(0, sample(name).lod_max + 1) for name in names])
-    assert len(check_pairs(scene, poses, worlds, statics)) > 600
 
 
 @pytest.mark.parametrize("worlds", ["one", "some", "shared first", "shared"])
@@ -185,7 +171,7 @@ def test_boxes_in_the_world_contain_what_they_box(device, far):
             assert most < Fraction(upper) < most + 4 * room
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_boxes_of_all_sizes(device, seed):
     """From a thousandth to one that holds all, in worlds of 1 to 500 objects with gaps between their numbers."""
     rng = np.random.default_rng(seed)
@@ -237,11 +223,11 @@ def test_closed_boxes_in_whole_numbers(device, count):
 
 @pytest.mark.slow
 def test_more_pairs_than_can_be_numbered(device, search):
-    """100,000 objects in one place: one error, and no count that has gone round."""
+    """66,000 objects in one place: one error, and no count that has gone round."""
     if search != "as by default" and not wp.get_device(device).is_cuda:
         pytest.skip("tiles of one object")
     scene = ab.Scene(device)
-    scene.add_many(sample("box"), np.tile(STILL, (100_000, 1)))
+    scene.add_many(sample("box"), np.tile(STILL, (66_000, 1)))
     refused(ab.CapacityError, "2\\^31 object pairs or more", scene.broad_phase)
 
 

@@ -113,12 +113,12 @@ def check_pair(device, model_a, pose_a, model_b, pose_b, lod):
 QUARTER_TURN = np.array([[0, -1, 0, 0.5], [1, 0, 0, 0.25], [0, 0, 1, 3], [0, 0, 0, 1]])
 
 
-@pytest.mark.parametrize("name", ["torus", "soup", "grid", *slow("cow", "fandisk", "fcl-env", "woody")])
+@pytest.mark.parametrize("name", ["torus", "soup", "grid", *slow("cow", "fcl-env")])
 @pytest.mark.parametrize("place", ["still", "quarter turn", *slow("any turn")])
 def test_coincident_meshes_equal_brute_force(device, name, place):
     """Every face is coplanar with its twin and touches its neighbours; at any other pose, a rounding apart."""
     model = rounded(name) if place == "quarter turn" else sample(name)
-    lod = model.lod_for(fraction=min(1.0, (200 if name in SHAPES else 1500) / model.face_count))
+    lod = model.lod_for(fraction=min(1.0, (200 if name in SHAPES else 1000) / model.face_count))
     anywhere = random_poses(np.random.default_rng(10), 1, 1.0)[0]
     pose = {"still": STILL, "quarter turn": QUARTER_TURN, "any turn": anywhere}[place]
     faces = check_pair(device, model, pose, model, pose, lod)
@@ -126,7 +126,7 @@ def test_coincident_meshes_equal_brute_force(device, name, place):
         assert {(f, f) for f in model.mesh_at(lod)[2]} <= set(map(tuple, faces.tolist()))
     if place == "quarter turn":
         np.testing.assert_array_equal(check_pair(device, model, STILL, model, STILL, lod), faces)
-    if place == "any turn" and name in ("cow", "fandisk", "fcl-env", "torus"):  # few pairs of the others differ
+    if place == "any turn" and name in ("cow", "fcl-env", "torus"):  # few pairs of the others differ
         scene = scene_of(device, [(model, lod, pose) * 2])
         rounded_faces = scene.intersect([(0, 1)], "faces", precision="float32").faces[:, 1:]
         assert not np.array_equal(rounded_faces, faces), "the case is too easy to tell exact signs from others"

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from helpers import refused
-from helpers.questions import captured, far_cases, in_a_row, pairs_of, parted_cases, scale_cases, scene_of
+from helpers.questions import captured, far_cases, in_a_row, pairs_of, parted_cases, scene_of
 from helpers.samples import STILL, contact_poses, sample
 from oracles.distance import mesh_distance
 
@@ -47,7 +47,7 @@ def test_single_faces_equal_brute_force(device, kind):
     """All ways in which two triangles can be closest, parallel ones and faces without area too."""
     rng = np.random.default_rng(2)
     cases = []
-    for _ in range(70):
+    for _ in range(48):
         a, b = rng.normal(size=(2, 3, 3))
         b += rng.normal(size=3) * 2
         if kind == "flat":
@@ -71,7 +71,7 @@ def test_single_faces_equal_brute_force(device, kind):
         cases.append((a, 0, STILL, b, 0, STILL))
     scene = scene_of(device, cases)
     distances = distances_of(scene, cases)
-    assert (distances > 0).sum() > 35
+    assert (distances > 0).sum() > 24
     check_distances(scene, pairs_of(cases), distances)
 
 
@@ -93,17 +93,6 @@ def test_coarse_proof_holds_for_the_original_meshes(device):
     assert not (result.apart & truth.any).any()
     assert result.apart.sum() > 30 and (~result.apart & ~truth.any).sum() > 5
     assert (~coarse.intersect(pairs).any & truth.any).any(), "coarse meshes alone give wrong answers here"
-
-
-@pytest.mark.parametrize("exponent", [-60, 31])
-def test_scaling_by_a_power_of_two_changes_nothing(device, exponent):
-    cases = parted_cases(np.random.default_rng(5), [("soup", "small ball")] * 20, least=1.0)
-    plain, scaled = scene_of(device, cases), scene_of(device, scale_cases(cases, exponent))
-    distances = distances_of(plain, cases)
-    for factor in (0, 1 - 1e-13, 1 - 1e-15, 1, 1 + 1e-15, 1 + 1e-13, 2):
-        one = plain.intersect(pairs_of(cases), within=factor * distances)
-        other = scaled.intersect(pairs_of(cases), within=factor * np.ldexp(distances, exponent))
-        np.testing.assert_array_equal(one.apart, other.apart)
 
 
 @pytest.mark.parametrize("far", [1e3, 1e6])
@@ -166,16 +155,3 @@ def test_query_takes_other_pairs_and_distances(device):
     np.testing.assert_array_equal(query.run().apart, apart)
     refused(ValueError, "without within", ab.Query(scene, "any", pairs=[(0, 1)]).set_pairs, [(0, 1)], within=1.0)
     assert scene.intersect(np.empty((0, 2), int), within=1.0).apart.shape == (0,)
-
-
-def test_broad_phase_pairs(device):
-    scene = ab.Scene(device)
-    for angle in np.linspace(0, 3, 8):  # a torus and balls inside its box, some in its hole
-        scene.add(sample("torus"), (0, 0, 100 * angle, 0, 0, 0, 1))
-        scene.add(sample("box"), (0.4 * angle, 0, 100 * angle, 0, 0, 0, 1))
-    query = ab.Query(scene, "any", within=0.01, capacity=ab.Buffers(pairs=2))
-    result = query.run()
-    order = np.lexsort(result.pairs.T[::-1])
-    expected = scene.intersect(result.pairs[order], within=0.01)
-    np.testing.assert_array_equal(result.apart[order], expected.apart)
-    assert scene.intersect(within=0.01).apart.shape == (len(order),)

@@ -124,15 +124,6 @@ def test_chunks_and_small_buffers_change_nothing(arm, monkeypatch):
         np.testing.assert_array_equal(arm.check(rows, AROUND, output=output), expected)
 
 
-def test_a_robot_alone_is_asked_about_itself(arm):
-    rows = random_configurations(50, seed=5)
-    alone = arm.check(rows)
-    assert 0 < alone.sum() < 50 and (arm.check(rows, AROUND) >= alone).all()
-    at = rows[np.flatnonzero(alone)[0]]
-    arm.exclude_meeting(at)
-    assert not arm.check(at[None])[0]
-
-
 def test_pairs_and_mounted_links_may_be_set(arm, device):
     rows = random_configurations(50, seed=5)
     alone, around, pairs = arm.check(rows), arm.check(rows, AROUND), arm.pairs

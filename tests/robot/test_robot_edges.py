@@ -152,22 +152,6 @@ def test_parts_of_a_robot_meet_each_other_whichever_moves(device, turned):
     assert (rows["time"] <= contact).all() and (rows["time"] >= np.minimum(contact, 1) - 1e-3 - 1e-12).all()
 
 
-def test_an_edge_passes_through_nothing_thin(arms, device):
-    arm = arms(device)
-    # A blade of no thickness in the way of the bent arm, which turns three times and stands free at most samples.
-    blade = [ab.Model.from_arrays([[0.3, 0, 0.2], [2, 0, 0.2], [2, 0, 3], [0.3, 0, 3]], [[0, 1, 2], [0, 2, 3]])]
-    ends = np.array([[-9.0, 1.4, 0.05, 0], [9.0, 1.4, 0.05, 0]])
-    sampled = arm.check(np.linspace(*ends, 60), blade)
-    assert not sampled[0] and sampled.mean() < 0.3
-    rows = arm.check_edges(ends[:1], ends[1:], blade, tolerance=1e-5)
-    assert not rows["clear"][0] and not rows["undecided"][0]
-    # Within the tolerance of the time there is contact, and before it none at as many more configurations.
-    time = rows["time"][0]
-    way = ends[1] - ends[0]
-    at, before = (ends[0] + np.linspace(*span, 500)[:, None] * way for span in ((time, time + 1e-5), (0, time)))
-    assert arm.check(at, blade).any() and not arm.check(before, blade).any()
-
-
 def test_edges_that_slide_are_undecided(arms, device, monkeypatch):
     arm = arms(device)
     monkeypatch.setattr(check, "STRETCHES_MAX", 64)

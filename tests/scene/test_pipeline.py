@@ -133,17 +133,6 @@ def test_answers_are_those_of_the_scene(device, case, captured):
     check_states(frame, scene)
 
 
-def test_worlds_statics_filter(device):
-    scene = ab.Scene(device)
-    for i, pose in enumerate(random_poses(np.random.default_rng(7), 12, 0.6)):
-        scene.add(sample(CROWD[i % len(CROWD)]), pose, world=i % 3 - 1, static=i % 4 < 2)
-    pairs = scene.broad_phase()
-    scene.filter(pairs[::3])
-    frame = ab.Pipeline(scene, "count")
-    assert 0 < len(scene.broad_phase()) < len(pairs)
-    assert ask_both(scene, frame, scenes.replay(frame), output="count") > 20
-
-
 def test_the_start_is_the_scene(device):
     scene = add_objects(device)
     lods = tops(scene) * np.arange(len(CROWD)) // len(CROWD)

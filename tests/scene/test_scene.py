@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from helpers import refused
-from helpers.questions import in_a_row, sort_rows, to_matrix
-from helpers.samples import STILL, random_poses, raw_state, sample, true_faces
-from helpers.scenes import TURN, add_objects, everything, pair_scene, scene_with
+from helpers.questions import in_a_row, to_matrix
+from helpers.samples import STILL, random_poses, raw_state, sample
+from helpers.scenes import TURN, everything, pair_scene, scene_with
 from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
@@ -106,29 +106,6 @@ def test_one_value_serves_all_objects_that_are_added(device):
     assert scene.object_importance == [2] * 4 and len(scene.broad_phase()) == 0
     refused(TypeError, None, scene.add_many, [sample("torus"), "torus"], [STILL] * 2)
     assert scene.models == [sample("box")] and scene.object_count == 4
-
-
-def test_a_query_follows_poses_and_lods(device):
-    rng, hits, pairs = np.random.default_rng(4), 0, [[0, 1], [2, 0], [3, 1], [2, 3]]
-    scene = add_objects(device, ["torus", "capsule", "torus", "crumbs"])
-    models = [scene.models[m] for m in scene.object_model]
-    asked, found = (ab.Query(scene, "faces", pairs=given, capacity=20_000) for given in (pairs, None))
-    for _ in range(6):
-        poses = random_poses(rng, 4, 0.6)
-        lods = [int(rng.integers(10, model.lod_max)) for model in models]
-        scene.set_poses(poses)
-        scene.set_lods(lods)
-        for query in (asked, found):
-            query.launch()
-            result = query.result()
-            result.check()
-            for p, (i, j) in enumerate(np.sort(result.pairs).tolist()):
-                faces = true_faces(models[i], lods[i], poses[i], models[j], lods[j], poses[j])
-                faces = faces if result.pairs[p, 0] == i else sort_rows(faces[:, ::-1])
-                np.testing.assert_array_equal(result.faces[result.faces[:, 0] == p][:, 1:], faces)
-                hits += len(faces)
-        assert asked.result().pairs.tolist() == pairs
-    assert hits > 100
 
 
 def test_what_is_printed_says_what_is_held(device):
@@ -320,14 +297,3 @@ def test_an_empty_scene(device):
         refused(ValueError, message, call, *given)
     scene.add(sample("box"))
     assert scene.broad_phase().shape == (0, 2) and scene.intersect().pairs.shape == (0, 2)
-
-
-@pytest.mark.parametrize("make", [ab.Query, lambda scene: ab.ContactQuery(scene, [(0, 1)])])
-def test_a_refused_object_spoils_no_query(device, make):
-    """One that is added does: a query is made for the objects there are."""
-    scene = pair_scene(device)
-    query = make(scene)
-    refused(ValueError, None, scene.add, sample("box"), lod=-1)
-    query.launch()
-    scene.add(sample("box"))
-    refused(RuntimeError, "make a new one", query.launch)

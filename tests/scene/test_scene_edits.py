@@ -210,15 +210,6 @@ def test_an_edit_is_made_wholly_or_not_at_all(device, edit):
     assert left > 20
 
 
-def test_a_scene_may_lose_all_objects(device):
-    scene = ab.Scene(device)
-    scene.add_many(sample("box"), [STILL] * 2)
-    scene.remove([1, 0])
-    assert len(scene.broad_phase()) == 0 and not scene.present.any()
-    assert scene.add_many(sample("torus"), [STILL] * 3).tolist() == [0, 1, 2]
-    assert scene.models == [sample("torus")] and len(scene.broad_phase()) == 3
-
-
 def test_changes_are_those_of_add_and_leave_the_rest(device):
     scene = pair_scene(device)
     scene.change(1, world=3, importance=2, name="bolt 7")
@@ -241,8 +232,13 @@ def test_changes_are_those_of_add_and_leave_the_rest(device):
     query = ab.Query(scene, "any", pairs=[(0, 1)])
     scene.change(0, name="nut")
     query.launch()
+    refused(ValueError, None, scene.add, sample("box"), lod=-1)
+    query.launch()
     scene.change(0, static=True)
     refused(RuntimeError, "changed", query.launch)
+    query = ab.Query(scene, "any", pairs=[(0, 1)])
+    scene.add(sample("box"))
+    refused(RuntimeError, "make a new one", query.launch)
 
 
 def test_an_edit_gives_all_memory_back_at_once(device):

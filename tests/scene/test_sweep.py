@@ -143,6 +143,7 @@ def test_refused(device, kept):
         ("within: -1.0 ", {"within": -1}),
         ("one distance for all", {"within": [1.0, 2.0]}),
         ("precision 'half'", {"precision": "half"}),
+        ("solid", {"solid": "yes"}),
         ("no device", {"device": "cuda:99"}),
         ("not a Model", {"model_b": "torus"}),
     ):

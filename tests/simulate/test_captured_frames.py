@@ -193,20 +193,6 @@ def test_what_changes_between_frames_is_followed(device):
     check(), check()
 
 
-def test_buffers_that_a_captured_frame_outruns_grow(device):
-    scene, motion = crowd(device)
-    with testing.regime(captures_frames=True):
-        frame = ab.Frame(scene, motion, None, "faces", 1 / 30)
-    pairs = []
-    for number in range(32):
-        result = frame.step()
-        result.check()
-        check_answer(result, scene, motion, number / 30)
-        pairs.append((len(result.pairs), len(result.faces)))
-    first, most = pairs[0], np.max(pairs, axis=0)
-    assert first[0] <= 64 < most[0] and first[1] <= 1024 < most[1]
-
-
 def test_bodies_whose_contacts_outrun_a_captured_frame_lose_none(device):
     """They do not move by some of their contacts: their bits are those of steps one after another."""
     plain, dynamics = heap(device), heap(device, capacity=ab.Buffers(1, pairs=1))

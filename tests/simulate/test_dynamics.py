@@ -113,8 +113,7 @@ def test_gravity_is_semi_implicit_euler_in_substeps(device):
     np.testing.assert_allclose(dynamics.poses()[0, :3], [0.625, 0, 0.125 / parts * falls.sum()], rtol=1e-13)
 
 
-@pytest.mark.parametrize("friction", [0, 0.5])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(("seed", "friction"), [(1, 0), (2, 0.5), (3, 0.5)])
 def test_free_collisions_keep_momentum_and_angular_momentum(device, seed, friction):
     """Six bodies that fly at each other and do not overlap at first."""
     rng = np.random.default_rng(seed)
@@ -140,16 +139,6 @@ def test_free_collisions_keep_momentum_and_angular_momentum(device, seed, fricti
     # A free tumble swings the energy a little; impulses add none.
     assert np.diff(energies).max() < 2e-5 * start[2]
     assert found[2] < 0.99 * start[2]
-
-
-def test_cubes_face_to_face(device):
-    """Along the line of centres momentum is 1 - 3, of masses that move on together."""
-    placed = (CUBE, (-0.55, 0, 0, 0, 0, 0, 1)), (box(3, 1, 1), (1.55, 0.001, 0.002, 0, 0, 0, 1))
-    dynamics = make(device, *placed, velocity=[[1, 0, 0], [-1, 0, 0]], friction=0, gravity=(0, 0, 0))
-    run(dynamics, 20, 0.01)
-    velocity, omega = dynamics.velocities()
-    np.testing.assert_allclose(velocity, np.tile([-0.5, 0, 0], (2, 1)), atol=0.02)
-    assert np.abs(omega).max() < 0.05
 
 
 def test_corrections_of_place_leave_velocity_and_energy(device):
@@ -194,23 +183,6 @@ def test_boxes_come_to_rest_on_a_plane(device):
         axis = int(np.argmax(r))
         assert r[axis] > 1 - 1e-4, "flat on a face"
         assert pose[2] == pytest.approx((0.5, 0.35, 0.25)[axis] - slop, abs=slop)
-
-
-def test_a_torus_falls_over_a_peg_and_stays(device):
-    peg = model_of(trimesh.creation.cylinder(0.3, 1.2, sections=8))
-    ring = model_of(trimesh.creation.torus(0.8, 0.25, 16, 8))
-    pose = (0.35, 0.05, 1.7, *about((2, 1, 0), 0.25))
-    dynamics = on_ground(device, (peg, (0, 0, 0.55, 0, 0, 0, 1), True), (ring, pose), friction=0.2)
-    pegged = []
-    for _ in range(240):
-        dynamics.step(1 / 60)
-        pegged.append(1 in np.unique(dynamics.query.result().pairs[dynamics.query.result().any]))
-    assert any(pegged), "it has met the peg"
-    assert np.abs(dynamics.velocities()).max() < 1e-6
-    x, y, z = dynamics.poses()[2, :3]
-    assert np.hypot(x, y) < 0.8 - 0.25 - 0.3 + 0.05, "the peg stands in the hole"
-    assert z == pytest.approx(0.25, abs=0.005)
-    assert abs(matrices_of(dynamics.poses()[2:, 3:])[0, 2, 2]) > 0.999
 
 
 def test_a_kinematic_floor_carries_and_stops(device):

@@ -7,7 +7,7 @@ from helpers.bodies import CUBE, about, box, on_ground, run
 from warp_abtree.simulate.body_state import mass_properties
 
 
-@pytest.mark.parametrize("splits, remember", [(0, False), (2, False), (0, True), (2, True)])
+@pytest.mark.parametrize("splits, remember", [(2, False), (0, True)])
 @pytest.mark.slow
 def test_a_stack_of_five_stands_for_ten_seconds(device, splits, remember):
     cube = box(1, 1, 1, splits=splits)
@@ -24,7 +24,7 @@ def test_a_stack_of_five_stands_for_ten_seconds(device, splits, remember):
     assert not remember or (dynamics.query.memory.place.numpy()[:5] >= 0).all()
 
 
-@pytest.mark.parametrize("offset", [0.0, 0.01, 0.02])
+@pytest.mark.parametrize("offset", [0.0, 0.02])
 @pytest.mark.slow
 def test_a_stack_of_ten_drifts_by_less_than_a_millimetre(device, offset):
     dynamics = on_ground(device, *((CUBE, (offset * (k % 2), 0, 0.5 + k, 0, 0, 0, 1)) for k in range(10)))

@@ -69,17 +69,6 @@ def test_capacity_grows_in_steps_and_is_refused_in_launches(device):
             short.check()
 
 
-def test_a_frame_steps_and_reports(device):
-    dynamics = heap(device)
-    frame = ab.Frame(dynamics.scene, motion=dynamics.motion(), time_step=1 / 120)
-    for _ in range(80):
-        result = frame.step()
-        assert result.pairs.tolist() == dynamics.query.result().pairs.tolist()
-        assert frame.history[-1].hits == result.count.sum()
-    assert np.array_equal(bits(dynamics), fall(device))
-    assert max(row.intersecting for row in frame.history) > 4
-
-
 @pytest.mark.parametrize(
     "options, message",
     [
