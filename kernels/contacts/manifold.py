@@ -11,6 +11,7 @@ from warp_abtree.kernels.contacts.column import (
     NO_DEPTH,
     POSSIBLE_CORNERS,
     Column,
+    FacePair,
     column_corner,
     column_slack,
     load_pair,
@@ -26,6 +27,10 @@ wp.set_module_options(native.options("contacts/slots.cuh"))
 POINTS = wp.constant(8)
 """Points that stand for a pair, unless told otherwise."""
 
+# Distance and depth, at unit size, under which faces touch.
+NO_DISTANCE = wp.constant(wp.float64(2.0**-30))
+# Cosine under which normals differ by more than rounding.
+ALONG = wp.constant(wp.float64(0.998))
 # A face's own normal serves in place of the loop's within 60 degrees of it.
 LIKENESS = wp.constant(wp.float64(0.5))
 # Depth of candidates that there are not; where all of a pair have NO_DEPTH the middles of its contacts serve.
@@ -74,15 +79,20 @@ def write_candidates(
     position: wp.vec3d,
     column: Column,
     least: wp.float64,
+    slack: wp.float64,
     witnesses: Witnesses,
 ):
-    """Write the candidates of a witness, posed to the world: the corners of a column that are deep enough."""
+    """Write the candidates of a witness, posed to the world: the corners of a column that are deep enough.
+
+    Args:
+        least: Depth of the least deep one; one that lacks no more than `slack` counts as so deep.
+    """
     witnesses.normal[w] = rotation * column.normal
     place, k = wp.int32(0), wp.int32(0)
     while k < POSSIBLE_CORNERS:
         point, depth, exists = column_corner(column, k)
-        if exists and depth >= least and place < COLUMN_CORNERS:
-            witnesses.depth[w, place] = depth
+        if exists and depth >= least - slack and place < COLUMN_CORNERS:
+            witnesses.depth[w, place] = wp.max(depth, least)
             witnesses.point[w, place] = pose_point(rotation, position, point)
             place += 1
         k += 1
@@ -106,6 +116,13 @@ def lies_in_front(n: wp.vec3d, u: wp.vec3d, v0: wp.vec3d, v1: wp.vec3d, v2: wp.v
     """Return whether a face lies in front of the plane through u whose normal is n."""
     least = wp.min(wp.dot(n, v0 - u), wp.min(wp.dot(n, v1 - u), wp.dot(n, v2 - u)))
     return least >= -slack and wp.dot(n, n) > wp.float64(0.0)
+
+
+@wp.func
+def touching_faces(pair: FacePair, normal_a: wp.vec3d, normal_b: wp.vec3d, slack: wp.float64):
+    """Return whether the second face of a pair lies in front of the first one, and the first in front of the second."""
+    touches_a = lies_in_front(normal_a, pair.a0, pair.b0, pair.b1, pair.b2, slack)
+    return touches_a, lies_in_front(normal_b, pair.b0, pair.a0, pair.a1, pair.a2, slack)
 
 
 @wp.struct
@@ -136,29 +153,31 @@ def load_crossing(i: wp.int32, batch: PairBatch, gap: wp.array(dtype=wp.float64)
 
 @wp.func
 def measure_crossing(crossing: Crossing, trees: Trees, pose: PairPose, contacts: Contacts, curves: Curves):
-    """Return the column of a contact of faces that cross, in A's frame.
+    """Return the column of a contact of faces that cross, in A's frame, and what its corners' depths may lack.
 
     Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least; of
     both faces' normals where neither is like it and one looks the other way. Where faces merely touch, the normal of a
     face that has the other in front serves, if it is like the loop's or that has no area, as rounding may have made it;
-    edges beside one another have none then.
+    edges beside one another have none then. Where faces are hardly in one another, a face's normal that rounding alone
+    makes as good as the loop's serves only if the other face lies in front.
     """
     pair = load_pair(trees, pose, crossing.faces)
     back = wp.transpose(trees.objects.rotation[crossing.a])
     normal_a = back * contacts.normal_a[crossing.i]
     normal_b = back * contacts.normal_b[crossing.i]
-    least, slack = crossing.least, column_slack(pair)
+    least, slack, shallow = crossing.least, column_slack(pair), NO_DISTANCE / pose.scale
     loop = back * curves.loop_normal[curves.loop[crossing.i]]
-    touches_a = lies_in_front(normal_a, pair.a0, pair.b0, pair.b1, pair.b2, slack)
-    touches_b = lies_in_front(normal_b, pair.b0, pair.a0, pair.a1, pair.a2, slack)
-    if curves.has_area[curves.loop[crossing.i]] != 0:
-        touches_a = touches_a and wp.dot(loop, normal_a) > LIKENESS
-        touches_b = touches_b and -wp.dot(loop, normal_b) > LIKENESS
-    if touches_a and touches_b and -wp.dot(normal_a, normal_b) < LIKENESS:
+    touches_a, touches_b = touching_faces(pair, normal_a, normal_b, slack)
+    has_area, opposed = curves.has_area[curves.loop[crossing.i]] != 0, -wp.dot(normal_a, normal_b) >= LIKENESS
+    if has_area or not opposed:
+        like = wp.where(has_area, LIKENESS, FACING)
+        touches_a = touches_a and wp.dot(loop, normal_a) > like
+        touches_b = touches_b and -wp.dot(loop, normal_b) > like
+    if touches_a and touches_b and not opposed:
         none = Column()
         none.normal = loop
         none.depth = NO_DEPTH
-        return none
+        return none, wp.float64(0.0)
     # Of columns only normals and depths are kept: a second one beside the first would not fit into registers.
     best_n, best_depth = wp.vec3d(loop), -wp.float64(wp.inf)
     toward_a, toward_b = wp.dot(loop, normal_a), -wp.dot(loop, normal_b)
@@ -166,21 +185,27 @@ def measure_crossing(crossing: Crossing, trees: Trees, pose: PairPose, contacts:
     # A loop that runs all round a part in another, as round a thread, has no one way out.
     contrary = FACING <= toward and toward <= LIKENESS and wp.min(toward_a, toward_b) < -FACING
     touches = touches_a or touches_b
+    first_a = touches_a and not (touches_b and toward_a < ALONG * toward_b)
     k = wp.int32(0)
     while k < wp.where(touches, 1, 3):
-        n = wp.where(k == 1 or (k == 0 and touches_a), normal_a, -normal_b)
+        n = wp.where(k == 1 or (k == 0 and first_a), normal_a, -normal_b)
         if k == 0 and not touches:
             n = loop
         if k == 0 or contrary or wp.dot(n, loop) > LIKENESS:
-            tight = k > 0 or touches
+            tight, more = k > 0 or touches, wp.float64(slack)
             depth = measure_column(pair, n, normal_a, normal_b, wp.where(tight, wp.min(least, -slack), least)).depth
-            if k == 0 or (depth >= -slack and (best_depth < -slack or depth <= best_depth + slack)):
+            if k > 0 and best_depth < shallow:
+                # Rounding does not tell a face that the other one cuts from one that it touches.
+                in_front_a, in_front_b = touching_faces(pair, normal_a, normal_b, shallow)
+                if not wp.where(k == 1, in_front_a, in_front_b):
+                    more = -slack
+            if k == 0 or (depth >= -slack and (best_depth < -slack or depth <= best_depth + more)):
                 best_n = n
                 best_depth = depth
         k += 1
     best, _ = make_column(pair, best_n, normal_a, normal_b)
     best.depth = best_depth
-    return best
+    return best, wp.where(touches and least == wp.float64(0.0), slack, wp.float64(0.0))
 
 
 @wp.kernel(cuda_max_registers=128)
@@ -208,7 +233,7 @@ def offer_crossing_kernel(
     crossing = load_crossing(i, batch, gap, faces[i], contacts)
     p = faces[i][0]
     pose = batch.poses[p]
-    column = measure_crossing(crossing, trees, pose, contacts, curves)
+    column, slack = measure_crossing(crossing, trees, pose, contacts, curves)
     sense = wp.where(pose.swapped != 0, wp.float64(-1.0), wp.float64(1.0))
     weight, directions = slots_inout.weight[p], slots_inout.directions
     bin, scores = find_bin(wp.vec3(sense * column.normal), directions), no_scores()
@@ -219,7 +244,7 @@ def offer_crossing_kernel(
     k = wp.int32(0)
     while k < POSSIBLE_CORNERS and column.depth > NO_DEPTH:
         point, depth, exists = column_corner(column, k)
-        if exists and depth >= crossing.least:
+        if exists and depth >= crossing.least - slack:
             x, s = wp.vec3((point - centre) * pose.scale), wp.float32(-depth * pose.scale)
             rate_point(x, s, weight, bin, directions, scores)
         k += 1
@@ -249,9 +274,9 @@ def find_crossing_kernel(
     if item[0] < 0 or item[0] >= NEAR_BIT:
         return
     crossing = load_crossing(item[1], batch, gap, faces[item[1]], contacts)
-    column = measure_crossing(crossing, trees, batch.poses[item[0]], contacts, curves)
+    column, slack = measure_crossing(crossing, trees, batch.poses[item[0]], contacts, curves)
     rotation, position = trees.objects.rotation[crossing.a], trees.objects.position[crossing.a]
     if column.depth == NO_DEPTH:
         write_middle(w, crossing.i, rotation * column.normal, contacts, witnesses_out)
     else:
-        write_candidates(w, rotation, position, column, crossing.least, witnesses_out)
+        write_candidates(w, rotation, position, column, crossing.least, slack, witnesses_out)

@@ -9,13 +9,20 @@ inside, or beyond a thin wall. In either case points count only where no other f
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ObjectPool, Trees
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.contacts.column import COLUMN_CORNERS, NO_DEPTH, column_slack, load_pair, measure_column
 from warp_abtree.kernels.contacts.contact import Contacts, contact_objects
-from warp_abtree.kernels.contacts.manifold import NO_POINT, Witnesses, write_candidates
+from warp_abtree.kernels.contacts.manifold import (
+    ALONG,
+    NO_DISTANCE,
+    NO_POINT,
+    Witnesses,
+    touching_faces,
+    write_candidates,
+)
 from warp_abtree.kernels.contacts.separation import write_near_contact
-from warp_abtree.kernels.contacts.slots import WitnessRows
+from warp_abtree.kernels.contacts.slots import WitnessRows, tree_size
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK, Hits
 
 wp.set_module_options(native.options("exact/double_word.cuh"))
@@ -24,28 +31,59 @@ wp.set_module_options(native.options("exact/double_word.cuh"))
 OPPOSED_LEAST = wp.constant(wp.float64(0.5))
 # Part of the distance that the gap along a face's normal differs by, where that is the direction of the distance.
 ALIKE = wp.constant(wp.float64(2.0**-10))
-# Cosine between a face's normal and the direction of the distance under which the gap differs by more than `ALIKE`.
-ALONG = wp.constant(wp.float64(0.998))
-
-# Distance, at unit size, under which faces touch.
-NO_DISTANCE = wp.constant(wp.float64(2.0**-30))
 # Cosine between the direction of a distance and a face's normal from which on the face does not look away from it; one
 # that is closer to the plane of one face of an edge is far from that of the other.
 LEAST_AHEAD = wp.constant(wp.float64(2.0**-10))
 
 
 @wp.func
+def which_touches(w: wp.int32, trees: Trees, a: wp.int32, b: wp.int32, pose: PairPose, faces: wp.vec3i, near: Contacts):
+    """Return which face of a contact touches the other one, which lies in front of it: the first, the second.
+
+    That of the larger object where both do, as edges beside one another; neither in one plane, or where they are apart.
+
+    Args:
+        a, b: Objects of the pair, the one in whose frame the pose is first.
+    """
+    touches_a, touches_b = bool(False), bool(False)
+    if near.separation[w] * pose.scale < NO_DISTANCE:
+        back, slack = wp.transpose(trees.objects.rotation[a]), NO_DISTANCE / pose.scale
+        normal_a, normal_b = back * near.normal_a[w], back * near.normal_b[w]
+        touches_a, touches_b = touching_faces(load_pair(trees, pose, faces), normal_a, normal_b, slack)
+        if touches_a and touches_b:
+            flat = -wp.dot(normal_a, normal_b) >= ALONG
+            larger = tree_size(trees, trees.objects.state[a]) >= tree_size(trees, trees.objects.state[b])
+            touches_a = not flat and larger == (pose.swapped == 0)
+            touches_b = not flat and not touches_a
+    return touches_a, touches_b
+
+
+@wp.func
 def write_nearest_points(
-    w: wp.int32, objects: ObjectPool, a: wp.int32, pose: PairPose, contacts: Contacts, witnesses: Witnesses
+    w: wp.int32,
+    trees: Trees,
+    a: wp.int32,
+    pose: PairPose,
+    touches_a: bool,
+    touches_b: bool,
+    contacts: Contacts,
+    witnesses: Witnesses,
 ):
     """Write the middle of the nearest points of a contact as its candidate, where both faces look at one another.
 
+    The normal is the direction of the distance; where faces touch, that of the face that has the other in front.
+
     Args:
         a: Object in whose frame the pose is.
+        touches_a, touches_b: As `which_touches` returns them.
     """
-    rotation, position = objects.rotation[a], objects.position[a]
+    rotation, position = trees.objects.rotation[a], trees.objects.position[a]
     back = wp.transpose(rotation)
-    n = contacts.normal[w]
+    n = wp.vec3d(contacts.normal[w])
+    if touches_a and wp.dot(n, contacts.normal_a[w]) < ALONG:
+        n = contacts.normal_a[w]
+    if touches_b and -wp.dot(n, contacts.normal_b[w]) < ALONG:
+        n = -contacts.normal_b[w]
     ahead = wp.dot(n, contacts.normal_a[w]) > LEAST_AHEAD and wp.dot(n, contacts.normal_b[w]) < -LEAST_AHEAD
     for k in range(COLUMN_CORNERS):
         witnesses.depth[w, k] = NO_POINT
@@ -66,16 +104,19 @@ def write_facing(
     a: wp.int32,
     pose: PairPose,
     faces: wp.vec3i,
+    touches_a: bool,
+    touches_b: bool,
     contacts: Contacts,
     witnesses: Witnesses,
 ):
     """Write the corners of the column of faces that look at one another as candidates; return whether they serve.
 
-    Along the normal of either face, whichever leaves the wider gap, if that is the distance. A face that lies behind
-    the other one's plane is inside, as deep as it is far.
+    Along the normal of either face, whichever leaves the wider gap, if that is the distance; where faces touch, that of
+    the face that has the other in front. A face that lies behind the other one's plane is inside, as deep as it is far.
 
     Args:
         a: Object in whose frame the pose is.
+        touches_a, touches_b: As `which_touches` returns them.
     """
     rotation = trees.objects.rotation[a]
     back = wp.transpose(rotation)
@@ -83,16 +124,16 @@ def write_facing(
     normal_a, normal_b = back * contacts.normal_a[w], back * contacts.normal_b[w]
     separation = contacts.separation[w]
     slack = wp.max(ALIKE * separation, column_slack(pair))
-    best = measure_column(pair, normal_a, normal_a, normal_b, -gap)
+    best = measure_column(pair, wp.where(touches_b, -normal_b, normal_a), normal_a, normal_b, -gap)
     # A gap wider than the distance stays so whatever the other normal says.
-    if best.depth == NO_DEPTH or -best.depth - separation <= slack:
+    if touches_a == touches_b and (best.depth == NO_DEPTH or -best.depth - separation <= slack):
         other = measure_column(pair, -normal_b, normal_a, normal_b, -gap)
         if other.depth > NO_DEPTH and (best.depth == NO_DEPTH or other.depth < best.depth):
             best = other
     serves = wp.abs(wp.abs(best.depth) - separation) <= slack
     if serves:
         witnesses.nearest_only[w] = wp.where(best.depth > slack, 1, 0)
-        write_candidates(w, rotation, trees.objects.position[a], best, -gap, witnesses)
+        write_candidates(w, rotation, trees.objects.position[a], best, -gap, wp.float64(0.0), witnesses)
     return serves
 
 
@@ -131,11 +172,12 @@ def find_near_witness_kernel(
     along = wp.max(wp.abs(wp.dot(n, normal_a)), wp.abs(wp.dot(n, normal_b)))
     # Of what touches rounding may tell the direction.
     served, touch = bool(False), contacts_out.separation[w] * pose.scale < NO_DISTANCE
+    touches_a, touches_b = which_touches(w, trees, own.a, own.b, pose, item, contacts_out)
     if contacts_out.separation[w] >= gap[p]:
         for k in range(COLUMN_CORNERS):
             witnesses_out.depth[w, k] = NO_POINT
         served = bool(True)
     elif -wp.dot(normal_a, normal_b) >= OPPOSED_LEAST and (along >= ALONG or touch):
-        served = write_facing(w, gap[p], trees, own.a, pose, item, contacts_out, witnesses_out)
+        served = write_facing(w, gap[p], trees, own.a, pose, item, touches_a, touches_b, contacts_out, witnesses_out)
     if not served:
-        write_nearest_points(w, trees.objects, own.a, pose, contacts_out, witnesses_out)
+        write_nearest_points(w, trees, own.a, pose, touches_a, touches_b, contacts_out, witnesses_out)
