@@ -143,7 +143,7 @@ def flag(value, what: str) -> bool:
 
 def broadcast_rows(values, what: str, shape: tuple, is_finite=True) -> np.ndarray:
     """Return finite numbers, or any if told, as float64 broadcast to a shape, a copy; raise ValueError for others."""
-    values = np.asarray(values, np.float64)
+    values = to_numpy(values, what).astype(np.float64)
     try:
         rows = np.broadcast_to(values, shape).copy()
     except ValueError:

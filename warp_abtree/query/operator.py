@@ -333,7 +333,7 @@ class Operator(DeviceMemory):
 
     def run(self, device: bool = False) -> Result:
         """Launch, grow buffers that were too small, and return the whole result, as `result`. Waits for the device."""
-        read = self.readout
+        read, device = self.readout, flag(device, "device")
         first = partial(read.launch_and_bring, self.launch_search) if read.repeats_calls(device) else None
         result = read.make_result(self._grow(partial(read.read_pairs, device), first=first), device)
         result.check()

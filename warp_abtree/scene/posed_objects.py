@@ -329,3 +329,10 @@ class PosedObjects(DeviceMemory):
             i = int(bad[0])
             raise ValueError(f"lods: object {i} asks for LOD {lods[i]}, outside 0 .. {top[i]}")
         return self.batch().set_lods(lods.astype(np.int64))
+
+
+def expect_scene(scene) -> Any:
+    """Return a scene; raise TypeError for anything else."""
+    if not isinstance(scene, PosedObjects):
+        raise TypeError(f"scene: a Scene is expected, not a {type(scene).__name__}")
+    return scene
