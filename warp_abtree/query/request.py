@@ -109,11 +109,18 @@ def check_options(taken: dict, output: str, precision: str, options: dict) -> di
     return given
 
 
-def check_gap(gap, pair_count, object_count: int) -> np.ndarray:
-    """Return gaps [world units] as `check_within`: () or (p,) beside given pairs, () or (n,) for the broad phase."""
+def check_gap(gap, pair_count, object_count: int, removed=()) -> np.ndarray:
+    """Return gaps [world units] as `check_within`: () or (p,) beside given pairs, () or (n,) for the broad phase.
+
+    Of objects that were removed nothing is read.
+    """
     if pair_count is not None:
         return check_within(gap, pair_count, "gap")
     known = f"pairs of the broad phase: one for all, or one for each of {object_count} objects"
+    gap = to_numpy(gap, "gap")
+    if len(removed) and gap.shape == (object_count,):
+        gap = gap.copy()
+        gap[removed] = 0
     return check_within(gap, object_count, "gap", known)
 
 

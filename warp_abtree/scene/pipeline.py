@@ -137,7 +137,7 @@ class Pipeline(DeviceMemory):
         group = np.arange(len(lods)) if groups is None else check_groups(groups, object_model)
         first = np.unique(group, return_index=True)[1]
         batch.replace_states(list(zip(object_model[first].tolist(), lods[first].tolist())), group)
-        return DeviceLodUpdate(batch.models, batch.states)
+        return DeviceLodUpdate(batch.models, batch.states, takes_any=group[batch.removed])
 
     def _make_ladder(self, lods, ladder, models):
         """Make a state a model and level."""

@@ -116,8 +116,10 @@ class RigidBodies(DeviceMemory):
         self.gravity = finite_array(gravity, "gravity", (3,))
         self.kinematic = object_mask(kinematic, n)
         self.rigid = ~self.kinematic & (pool.is_static.numpy() == 0)
-        velocity = broadcast_rows(velocity, "velocity", (n, 3))
-        angular_velocity = broadcast_rows(angular_velocity, "angular_velocity", (n, 3))
+        velocity, angular_velocity = (
+            broadcast_rows(values, name, (n, 3), unread=scene.batch().removed)
+            for name, values in (("velocity", velocity), ("angular_velocity", angular_velocity))
+        )
         models = sorted({scene.object_model[i] for i in np.flatnonzero(self.rigid)})
         found = {m: mass_properties(scene.models[m]) for m in models}
         own = [found[m] if r else IMMOVABLE for m, r in zip(scene.object_model, self.rigid)]
