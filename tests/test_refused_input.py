@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import partial
 
 import numpy as np
 import pytest
@@ -87,6 +88,12 @@ REFUSED = [
     *refuse("^device 'cpu'", lambda x: balls().first_contact(None, np.eye(4)[None].repeat(2, 0), device=x), "cpu"),
     *refuse("^output ", in_scene, ["any"], 1, None),
     *refuse("^output ", swept, ["any"], 1, None),
+    *refuse("^output ", lambda x: ab.Query(balls(), x), ["any"], np.zeros(0)),
+    *refuse_options(in_scene, "precision", "any", (["exact"], np.zeros(0))),
+    *refuse_options(in_scene, "precision", "distance", (["exact"], np.zeros(0))),
+    *refuse("^sort_pairs ", lambda x: ab.Query(balls(), sort_pairs=x), *NO_FLAG),
+    *refuse("^pairs: ", lambda x: ab.DistanceQuery(balls(), x), 1.5, 0),
+    *refuse("^static ", lambda x: balls().change(0, static=x), [[True, False], [True]]),
     *refuse_options(in_scene, "within gap", "contacts", NO_NUMBER),
     *refuse_options(in_scene, "tolerance relative beyond", "distance", NO_NUMBER),
     *refuse_options(in_scene, "signed originals", "distance", NO_FLAG),
@@ -98,11 +105,40 @@ REFUSED = [
     *refuse("^end_poses: ", lambda x: swept(output="first_contact", end_poses=x), False, "x"),
     *refuse("^orient ", lambda x: ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], orient=x), *NO_FLAG, None),
     *refuse("^solid .*'closed'", lambda x: ab.scene_from_trimesh(trimesh.Scene(), solid=x), *NO_FLAG, None),
+    *refuse("^device ", lambda x: ab.Query(balls(), "any").run(x), *NO_FLAG),
+    *refuse("^device ", lambda x: ab.Query(balls(), "any").result(x), *NO_FLAG),
+    *refuse("^output ", lambda x: ab.Frame(balls(), output=x), np.zeros(0)),
+    *refuse("^dt\\b", lambda x: ab.Dynamics(balls()).launch(x), 0, -1, np.nan, np.inf, "x", None),
+    *refuse("^velocity: ", lambda x: ab.Dynamics(balls(), velocity=x), "x", object(), 10**400),
+    *refuse("^kinematic: ", lambda x: ab.Dynamics(balls(), kinematic=x), [[0], [0, 1]]),
+    *refuse("^position: ", lambda x: ab.Kinematic(x), "x", object(), 10**400),
     *refuse("friction", lambda x: ab.Dynamics(balls(count=1), friction=x), np.inf),
     *refuse(
         "base_faces", lambda x: ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], base_faces=x), 0, 1.5, np.inf, "ten", True
     ),
 ]
+
+
+NO_SCENES = ab.Pipeline, ab.PoseInput, ab.Dynamics, ab.Frame, ab.ToleranceController, ab.PaperController
+NO_SCENES += ab.PredictiveController, ab.to_trimesh, ab.Query, ab.ContactQuery, ab.ManifoldQuery, ab.DistanceQuery
+
+
+@pytest.mark.parametrize("make", NO_SCENES)
+def test_what_is_no_scene_is_named(make):
+    for given in (None, "x", np.zeros(3), ab.Scene, sample("small ball")):
+        refused(TypeError, "^scene: a Scene", make, given, *([8.0] if "Controller" in make.__name__ else []))
+
+
+def test_other_types_are_named():
+    manager, scene = ab.CollisionManager("cpu"), balls()
+    for call, given, message in (
+        (manager.first_contact_internal, None, "^transforms is a NoneType"),
+        (manager.in_collision_other, [[]], "^other_manager is a list"),
+        (manager.min_distance_other, [], "^other_manager is a list"),
+        (partial(ab.to_trimesh, scene), "x", "^result: a Result"),
+        (partial(ab.Frame, scene), object(), "^motion: a object"),
+    ):
+        refused(TypeError, message, call, given)
 
 
 @pytest.mark.parametrize(("message", "call"), REFUSED)

@@ -60,13 +60,17 @@ class StatePool:
     face_corner: wp.array(dtype=wp.vec4i)  # active ancestors of its corners, -1 where inactive, shape [face]
 
 
+# In the place of whether an object is static: a place without one, of which nothing that is given is read.
+NO_OBJECT = wp.constant(2)
+
+
 @wp.struct
 class ObjectPool:
     """Posed objects: x_world = rotation x_model + position."""
 
     state: wp.array(dtype=wp.int32)  # tree state, shape [object]
     world: wp.array(dtype=wp.int32)  # -1 is every world, shape [object]
-    is_static: wp.array(dtype=wp.int32)  # 0 or 1, shape [object]
+    is_static: wp.array(dtype=wp.int32)  # 0, 1 or NO_OBJECT, shape [object]
     rotation: wp.array(dtype=wp.mat33d)  # shape [object]
     position: wp.array(dtype=wp.vec3d)  # [world units], shape [object]
 

@@ -12,12 +12,15 @@ from warp_abtree.kernels.base.lanes import add_in_order, count_lanes, first_lane
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.contacts.contact import Contacts, pair_direction
 from warp_abtree.kernels.contacts.manifold import Curves
+from warp_abtree.kernels.triangle.distance import largest_coordinate
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
 wp.set_module_options(native.options("base/lanes.cuh", "io/sort_by_pair.h"))
 
 # Areas of a loop, relative to its length squared, that have no direction worth the name.
 LEAST_LOOP_AREA = wp.constant(wp.float64(2.0**-20))
+# Lengths of a loop, relative to its coordinates, of which rounding tells the area.
+LEAST_LOOP_LENGTH = wp.constant(wp.float64(2.0**-42))
 
 
 @wp.func
@@ -222,7 +225,8 @@ def average_loop_kernel(
     """Find the normals of loops, by the warp of their first contact: the direction of the area within the curve.
 
     Moving an object by dx changes the volume that closed surfaces share by the vector area of the curve times dx, so
-    this is the direction that frees them soonest. An open or empty curve takes the mean of its contacts' normals.
+    this is the direction that frees them soonest. An open or empty curve, or one too short for its coordinates, takes
+    the mean of its contacts' normals.
     """
     last = start[start.shape[0] - 1]
     k = wp.tid()
@@ -238,16 +242,18 @@ def average_loop_kernel(
             # About the mean point, since for an open curve the area depends on where it is measured from.
             about = wp.cross(sums.middle / sums.total, sums.gap)
             n = (sums.area - wp.float64(0.5) * about) / (sums.total * sums.total)
-        has_area = wp.where(measure_length(n) > LEAST_LOOP_AREA, 1, 0)
+        root = order[first]
+        far = wp.float64(1.0) / batch.poses[faces[root][0]].scale + largest_coordinate(contacts.p0[root])
+        has_area = wp.where(measure_length(n) > LEAST_LOOP_AREA and sums.total > LEAST_LOOP_LENGTH * far, 1, 0)
         if has_area == 0:
             n = sums.mean
             if measure_length(sums.mean) <= LEAST_LOOP_AREA * sums.total:
                 n = sums.plain
             if measure_length(sums.plain) <= LEAST_LOOP_AREA:
-                p = faces[order[first]][0]
+                p = faces[root][0]
                 n = pair_direction(trees, batch.pairs[p][0], batch.pairs[p][1])
         begins = begins and warp_lane() != lane
         if warp_lane() == 0:
-            curves_inout.loop_normal[order[first]] = unit_vector(n)
-            curves_inout.has_area[order[first]] = has_area
+            curves_inout.loop_normal[root] = unit_vector(n)
+            curves_inout.has_area[root] = has_area
         lane = first_lane(begins)

@@ -81,6 +81,7 @@ def find_crossing(
     loop: wp.vec3d,
     has_area: bool,
     gap: wp.float64,
+    scale: wp.float64,
     w: wp.int32,
     witnesses: Witnesses,
 ) -> bool:
@@ -204,5 +205,5 @@ def find_crossing_kernel(
     i, root = item[1], curves.loop[item[1]]
     pair, has_area = load_crossing(i, trees, batch, faces[i], contacts), curves.has_area[root] != 0
     loop, shell = curves.loop_normal[root], gap_of(gap, item[0])
-    if not find_crossing(trees.objects, pair, loop, has_area, shell, w, witnesses_out):
+    if not find_crossing(trees.objects, pair, loop, has_area, shell, batch.poses[item[0]].scale, w, witnesses_out):
         write_middle(w, i, contacts, witnesses_out)

@@ -12,10 +12,10 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, Trees
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.contacts.column import COLUMN_CORNERS, FacePair, load_pair
-from warp_abtree.kernels.contacts.contact import Contacts, contact_objects
+from warp_abtree.kernels.contacts.contact import Contacts, PairObjects, contact_objects
 from warp_abtree.kernels.contacts.manifold import NO_POINT, Witnesses
 from warp_abtree.kernels.contacts.separation import write_near_contact
-from warp_abtree.kernels.contacts.slots import WitnessRows
+from warp_abtree.kernels.contacts.slots import WitnessRows, tree_size
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK, Hits
 
 wp.set_module_options(native.options("contacts/candidates.cuh", "exact/double_word.cuh"))
@@ -32,18 +32,53 @@ NO_DISTANCE = wp.constant(wp.float64(2.0**-30))
 LEAST_AHEAD = wp.constant(wp.float64(2.0**-10))
 
 
+@native.func_native()
+def touching_faces(objects: ObjectPool, pair: FacePair, scale: wp.float64) -> wp.int32:
+    """Return 1 where the second face lies in front of the first one, plus 2 where the first lies in front of it."""
+
+
+@wp.func
+def which_touches(w: wp.int32, trees: Trees, own: PairObjects, pose: PairPose, pair: FacePair, near: Contacts):
+    """Return which face of a contact touches the other one, which lies in front of it: 1, the first, 2, or 0.
+
+    That of the larger object where both do, as edges beside one another; neither in one plane, or where they are apart.
+    """
+    touching = wp.int32(0)
+    if near.separation[w] * pose.scale < NO_DISTANCE:
+        touching = touching_faces(trees.objects, pair, pose.scale)
+        if touching == 3:
+            size_a, size_b = tree_size(trees, trees.objects.state[own.a]), tree_size(trees, trees.objects.state[own.b])
+            touching = wp.where((size_a >= size_b) == (pose.swapped == 0), 1, 2)
+            if -wp.dot(near.normal_a[w], near.normal_b[w]) >= ALONG:
+                touching = wp.int32(0)
+    return touching
+
+
 @wp.func
 def write_nearest_points(
-    w: wp.int32, objects: ObjectPool, a: wp.int32, pose: PairPose, contacts: Contacts, witnesses: Witnesses
+    w: wp.int32,
+    objects: ObjectPool,
+    a: wp.int32,
+    pose: PairPose,
+    touching: wp.int32,
+    contacts: Contacts,
+    witnesses: Witnesses,
 ):
     """Write the middle of the nearest points of a contact as its candidate, where both faces look at one another.
 
+    The normal is the direction of the distance; where faces touch, that of the face that has the other in front.
+
     Args:
         a: Object in whose frame the pose is.
+        touching: As `which_touches`.
     """
     rotation, position = objects.rotation[a], objects.position[a]
     back = wp.transpose(rotation)
-    n = contacts.normal[w]
+    n = wp.vec3d(contacts.normal[w])
+    if touching == 1 and wp.dot(n, contacts.normal_a[w]) < ALONG:
+        n = contacts.normal_a[w]
+    if touching == 2 and -wp.dot(n, contacts.normal_b[w]) < ALONG:
+        n = -contacts.normal_b[w]
     ahead = wp.dot(n, contacts.normal_a[w]) > LEAST_AHEAD and wp.dot(n, contacts.normal_b[w]) < -LEAST_AHEAD
     for k in range(COLUMN_CORNERS):
         witnesses.depth[w, k] = NO_POINT
@@ -58,12 +93,18 @@ def write_nearest_points(
 
 @native.func_native()
 def find_facing(
-    objects: ObjectPool, pair: FacePair, gap: wp.float64, separation: wp.float64, w: wp.int32, witnesses: Witnesses
+    objects: ObjectPool,
+    pair: FacePair,
+    gap: wp.float64,
+    separation: wp.float64,
+    touching: wp.int32,
+    w: wp.int32,
+    witnesses: Witnesses,
 ) -> bool:
     """Write the corners of the column of faces that look at one another as candidates; return whether they serve.
 
-    Along the normal of either face, whichever leaves the wider gap, if that is the distance. A face that lies behind
-    the other one's plane is inside, as deep as it is far.
+    Along the normal of either face, whichever leaves the wider gap, if that is the distance; where faces touch, that of
+    the face that has the other in front. A face that lies behind the other one's plane is inside, as deep as it is far.
     """
 
 
@@ -102,12 +143,14 @@ def find_near_witness_kernel(
     along = wp.max(wp.abs(wp.dot(n, normal_a)), wp.abs(wp.dot(n, normal_b)))
     # Of what touches rounding may tell the direction.
     served, touch = bool(False), contacts_out.separation[w] * pose.scale < NO_DISTANCE
+    pair = load_pair(trees, pose, own.a, item, normal_a, normal_b)
+    touching = which_touches(w, trees, own, pose, pair, contacts_out)
     if contacts_out.separation[w] >= gap[p]:
         for k in range(COLUMN_CORNERS):
             witnesses_out.depth[w, k] = NO_POINT
         served = bool(True)
     elif -wp.dot(normal_a, normal_b) >= OPPOSED_LEAST and (along >= ALONG or touch):
-        pair = load_pair(trees, pose, own.a, item, normal_a, normal_b)
-        served = find_facing(trees.objects, pair, gap[p], contacts_out.separation[w], w, witnesses_out)
+        separation = contacts_out.separation[w]
+        served = find_facing(trees.objects, pair, gap[p], separation, touching, w, witnesses_out)
     if not served:
-        write_nearest_points(w, trees.objects, own.a, pose, contacts_out, witnesses_out)
+        write_nearest_points(w, trees.objects, own.a, pose, touching, contacts_out, witnesses_out)

@@ -12,11 +12,14 @@ from warp_abtree.kernels.contacts.slots import WitnessRows
 from warp_abtree.kernels.distance.frame import make_scale
 from warp_abtree.kernels.inside.nearest_face import make_solid, nearest_face
 from warp_abtree.kernels.intersect.face_pairs import PAIR_MASK, Hits
+from warp_abtree.kernels.triangle.distance import largest_coordinate
 
 wp.set_module_options(native.options("distance/point_boxes.cuh"))
 
 # Part of a distance under which another face is nearer.
 NEARER = wp.constant(wp.float64(0.999))
+# Part of sizes and positions that nearest points err by.
+POINT_ROUNDING = wp.constant(wp.float64(2.0**-48))
 
 
 @wp.kernel(cuda_max_registers=128)
@@ -37,7 +40,8 @@ def keep_nearest_kernel(
     a, b = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.max(batch.pairs[p][0], batch.pairs[p][1])
     scaling = make_scale(trees, pose, a, b)
     back, position = wp.transpose(trees.objects.rotation[a]), trees.objects.position[a]
-    near = NEARER * contacts.separation[w]
+    rounding = POINT_ROUNDING * (wp.float64(1.0) / pose.scale + largest_coordinate(position))
+    near = NEARER * contacts.separation[w] - rounding
     k = wp.int32(0)
     while k < 2:
         of_b = k != pose.swapped

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ObjectPool
+from warp_abtree.kernels.base.arrays import NO_OBJECT, ObjectPool
 from warp_abtree.kernels.base.generation import LaunchRecord, record_launch
 from warp_abtree.kernels.base.poses import PairBatch, rotate_quaternion
 from warp_abtree.kernels.intersect.face_pairs import Hits, read_total
@@ -40,10 +40,10 @@ def place_object(
     objects: ObjectPool,
     faults: wp.array(dtype=wp.int32),
 ):
-    """Do what `set_pose` does; a bad row moves nothing and is a fault."""
+    """Do what `set_pose` does; a bad row moves nothing and is a fault, but of a place without an object."""
     if is_quaternion_pose(tolerance, poses, i):
         set_pose(i, poses, objects)
-    else:
+    elif objects.is_static[i] != NO_OBJECT:
         note_fault(faults, i)
 
 

@@ -338,7 +338,7 @@ def wanted_update(shallow: bool):
                 states_inout.lod[state] = lod
                 plan_out.changed_count[state] = 0
                 plan_out.marked_count[state] = 0
-                if lod != wanted[state]:
+                if lod != wanted[state] and plan_out.takes_any[state] == 0:
                     note_fault(faults_inout, state)
             if lod != old:
                 update_state(own, models, states_inout, find_slice(splits, model, old, lod), plan_out)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_abtree.kernels.base.arrays import ObjectPool
+from warp_abtree.kernels.base.arrays import NO_OBJECT, ObjectPool
 from warp_abtree.kernels.update.work_lists import note_fault
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -41,7 +41,7 @@ def place_level(i: wp.int32, levels: Levels, objects: ObjectPool):
     # The last one where all are coarser.
     level = wp.lower_bound(levels.lod, levels.start[model], levels.start[model + 1], wanted)
     level = wp.min(level, levels.start[model + 1] - 1)
-    if wanted < 0 or wanted > levels.lod[level]:
+    if (wanted < 0 or wanted > levels.lod[level]) and objects.is_static[i] != NO_OBJECT:
         note_fault(levels.faults, i)
     old = levels.level[i]
     change = wp.int32(LEVEL_STAYED)

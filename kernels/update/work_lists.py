@@ -50,6 +50,7 @@ class UpdateLists:
     level_node: wp.array(dtype=wp.vec2i)  # (state, node), level by level
     changed_count: wp.array(dtype=wp.int32)  # faces that change, shape [state]
     marked_count: wp.array(dtype=wp.int32)  # nodes refitted, shape [state]
+    takes_any: wp.array(dtype=wp.int32)  # 1 where no LOD wanted on the device is a fault, shape [state]
 
 
 @wp.struct
@@ -166,7 +167,7 @@ def plan_update_kernel(
     s = wp.tid()
     model = states_inout.model[s]
     lod = wp.clamp(wanted[s], 0, models.lod_max[model])
-    if lod != wanted[s]:
+    if lod != wanted[s] and plan_inout.takes_any[s] == 0:
         note_fault(faults_inout, s)
     old = states_inout.lod[s]
     if lod == old:

@@ -13,6 +13,7 @@ from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.checks.quaternions import multiply_quaternions
 
 UP = [0, 0, 1.0]
 
@@ -142,3 +143,33 @@ def test_edges_have_points_only_where_no_other_face_is_nearer(device, named):
             assert nearer > 0.998999
             kept += 1
     assert kept > 1 and dropped > 10
+
+
+RESTS = {
+    "cube": trimesh.creation.box().subdivide(),
+    "cylinder": trimesh.creation.cylinder(0.5, 0.4, sections=16),
+    "ring": trimesh.creation.annulus(0.3, 0.5, 0.3, sections=24),
+    "ball": trimesh.creation.icosphere(1, 0.5),
+    "spike": trimesh.creation.cone(0.1, 1, sections=8, transform=np.diag([1, -1, -1, 1])),
+    "blade": trimesh.convex.convex_hull(
+        np.array([[x, y, z] for x in (-0.5, 0.5) for y, z in ((-0.1, 0.8), (0.1, 0.8), (0, 0))])
+    ),
+}
+
+
+@pytest.mark.parametrize("name", RESTS)
+def test_points_of_what_merely_touches_push_upwards(device, name):
+    """Faces, edges and corners on a floor, as near as rounding tells, whatever faces meet beside one another there."""
+    rng, mesh, floor, wrong = np.random.default_rng(0), RESTS[name], box(16, 8, 1, splits=2), []
+    model = ab.Model.load(mesh, base_faces=len(mesh.faces))
+    for height, whole, turn in itertools.product((0, 1e-17, 1e-15, 1e-12), (False, True), (0, 0, 0.7, 1)):
+        q = rng.normal(size=4) if whole else np.array([0, 0, 0, 1.0])
+        q, t = q / np.linalg.norm(q), whole * rng.uniform(-9, 9, 3)
+        r, spin = quaternion_matrix(q), about(UP, turn)
+        place = (0, 0, height - mesh.bounds[0, 2]) if turn < 1 else (*rng.uniform(-2, 2, 2), height - mesh.bounds[0, 2])
+        poses = (*(r @ [0, 0, -0.5] + t), *q), (*(r @ place + t), *multiply_quaternions(q, spin))
+        points = ask_points(device, (floor, poses[0]), (model, poses[1]), gap=0.01)[1].points
+        up = points["normal"] @ r @ UP
+        if len(up) == 0 or up.min() < 0.999 or abs(points["depth"].max() + height) > 1e-9:
+            wrong.append((height, whole, turn, up, points["depth"]))
+    assert not wrong

@@ -73,6 +73,17 @@ def test_known_ways_out(device, first, second, offset, truth, solid):
         np.testing.assert_allclose(every.depth, truth, rtol=0, atol=1e-9)
 
 
+def test_objects_of_one_size_in_both_orders(device):
+    """Whichever is named first, the same axes are tried."""
+    poses = random_poses(np.random.default_rng(3), 12, 0.3)
+    scene = scene_with(device, *((block(1, 0.7, 0.4), pose) for pose in poses))
+    pairs = np.array([(i, i + 1) for i in range(0, 12, 2)])
+    there, back = (scene.penetration(p, tolerance=FINE) for p in (pairs, pairs[:, ::-1]))
+    assert there.depth.all()
+    np.testing.assert_allclose(there.depth, back.depth, rtol=1e-9)
+    np.testing.assert_allclose(there.direction, -back.direction, atol=1e-12)
+
+
 @pytest.mark.parametrize("names", [("torus", "capsule"), ("soup", "crumbs"), ("lattice soup", "three")])
 def test_each_direction_against_brute_force(device, names):
     """Meshes at LODs, open and not manifold; alone, each direction has the depth that the least of many is taken of."""

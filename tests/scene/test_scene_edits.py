@@ -19,6 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import warp_abtree as ab
+from warp_abtree.interop.tape import record_pair_distance
 from warp_abtree.model.mesh import MeshError
 from warp_abtree.query.operator import Operator
 
@@ -139,6 +140,43 @@ def test_what_is_removed_is_nowhere(device):
     # The filter of objects 0 and 1 went with object 1.
     assert scene.add(sample("box"), (0.5, 0.25, 0, 0, 0, 0, 1)) == 1
     assert [0, 1] in scene.broad_phase().tolist()
+
+
+def launched(operator, poses=None, lods=None):
+    """Launch an operator with poses and LODs written to its arrays, and raise what it finds wrong with them."""
+    for array, values in ((operator.poses, poses), (getattr(operator, "lods", None), lods)):
+        if values is not None:
+            array.assign(values)
+    operator.launch()
+    operator.check()
+
+
+def test_operators_read_nothing_of_places_without_an_object(device):
+    scene = pair_scene(device)
+    scene.remove(1)
+    poses, nothing = scene.poses, np.array([np.zeros(3), [np.nan] * 3, np.zeros(3)])
+    poses[1] = np.nan
+    levels = [[0, model.lod_max] for model in scene.models]
+    for options in ({}, {"groups": [0, 1, 0]}, {"ladder": levels}):
+        wanted = [3, -7] if "groups" in options else [3, -7, 3]
+        launched(ab.Pipeline(scene, **options), poses, wanted)
+        for bad in (poses[[1, 0, 0]], None), (None, [-7, *wanted[1:]]):
+            refused(ValueError, "0, and ", launched, ab.Pipeline(scene, **options), *bad)
+    launched(ab.PoseInput(scene), poses)
+    refused(ValueError, "object 2, and|object that had one is 2", launched, ab.PoseInput(scene), poses[[0, 0, 1]])
+    bodies = ab.Dynamics(scene, velocity=nothing, angular_velocity=nothing, kinematic=[0])
+    bodies.step(0.01, poses)
+    assert np.isfinite(bodies.poses()).all()
+    for bad in (np.nan, -1):
+        ab.ContactQuery(scene, gap=[0.1, bad, 0.1]).run()
+        refused(ValueError, "^gap: .* of object 2", ab.ContactQuery, scene, gap=[0.1, bad, bad])
+    query, tape = ab.DistanceQuery(scene, [(0, 2)]), wp.Tape()
+    for rows in (poses, np.where(np.isnan(poses[:, :1, None]), np.nan, np.eye(4))):
+        given = wp.array(rows, dtype=wp.float64, requires_grad=True, device=device)
+        distance = record_pair_distance(tape, query, given)
+        tape.backward(grads={distance: wp.ones_like(distance)})
+        assert np.isfinite(given.grad.numpy()).all() and not given.grad.numpy()[1].any()
+        tape.reset()
 
 
 @pytest.mark.parametrize("exponent", [-99, 0, 99])

@@ -141,13 +141,17 @@ def flag(value, what: str) -> bool:
     return bool(value)
 
 
-def broadcast_rows(values, what: str, shape: tuple, is_finite=True) -> np.ndarray:
-    """Return finite numbers, or any if told, as float64 broadcast to a shape, a copy; raise ValueError for others."""
-    values = np.asarray(values, np.float64)
+def broadcast_rows(values, what: str, shape: tuple, is_finite=True, unread=()) -> np.ndarray:
+    """Return finite numbers, or any if told, as float64 broadcast to a shape, a copy; raise ValueError for others.
+
+    Rows of `unread` are 0, whatever was given.
+    """
+    values = to_numpy(values, what).astype(np.float64)
     try:
         rows = np.broadcast_to(values, shape).copy()
     except ValueError:
         raise ValueError(f"{what}: shape {values.shape} does not stretch to {shape}") from None
+    rows[list(unread)] = 0.0
     if is_finite and not np.isfinite(rows).all():
         raise ValueError(f"{what}: a number is not finite")
     return rows

@@ -6,6 +6,7 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, wrap_array
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.kernels.io import pipeline as kernels
+from warp_abtree.scene.posed_objects import expect_scene
 from warp_abtree.state.device_update import NO_FAULTS
 from warp_abtree.state.generation import STALE_GRAPH, LaunchGuard
 from warp_abtree.state.poses import QUATERNION_TOLERANCE
@@ -23,7 +24,7 @@ class PoseInput(DeviceMemory):
     """
 
     def __init__(self, scene):
-        check_device(scene.device, "making a PoseInput")
+        check_device(expect_scene(scene).device, "making a PoseInput")
         self.scene = scene
         self.device = scene.device
         self._batch = scene.batch()

@@ -1,6 +1,7 @@
 """CollisionManager: a drop-in replacement for trimesh.collision.CollisionManager, with exact answers in batches."""
 
 import math
+from collections.abc import Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -135,13 +136,10 @@ class CollisionManager(DeviceMemory):
 
     @contextmanager
     def _pairs_with(self, guests):
-        """Add guests for the duration of one call: name, `Shape` and matrix of each, or a manager that has them.
+        """Add guests for the duration of one call: name, `Shape` and matrix of each.
 
         Yields pairs of slots (own, guest), and a function of an index that returns the pair's names.
         """
-        if not isinstance(guests, list | CollisionManager):
-            raise TypeError(f"other_manager is a {type(guests).__name__}, not a warp_abtree.CollisionManager")
-        guests = guests.placed_objects() if isinstance(guests, CollisionManager) else guests
         slots = []
         try:
             for _, shape, matrix in guests:
@@ -164,6 +162,12 @@ class CollisionManager(DeviceMemory):
         names, own = list(self._slots), np.array(list(self._slots.values()), np.int32)
         i, j = np.triu_indices(len(own), 1)
         return np.stack([own[i], own[j]], 1), lambda k: (names[i[k]], names[j[k]])
+
+    @staticmethod
+    def _objects_of(other_manager) -> list:
+        if not isinstance(other_manager, CollisionManager):
+            raise TypeError(f"other_manager is a {type(other_manager).__name__}, not a warp_abtree.CollisionManager")
+        return other_manager.placed_objects()
 
     def _external(self, mesh, transform):
         return [(EXTERNAL, shape_of(mesh, EXTERNAL), self._matrix(transform, EXTERNAL))]
@@ -235,7 +239,7 @@ class CollisionManager(DeviceMemory):
 
         Pairs are (name here, name there). Raises TypeError for what is no `CollisionManager` of this library.
         """
-        any_hit, hits, contacts = self._collide_with(other_manager, return_names, return_data)
+        any_hit, hits, contacts = self._collide_with(self._objects_of(other_manager), return_names, return_data)
         return _join(any_hit, (return_names, set(hits)), (return_data, contacts))
 
     # Distances.
@@ -261,7 +265,7 @@ class CollisionManager(DeviceMemory):
 
         Raises TypeError for what is no `CollisionManager` of this library.
         """
-        with self._pairs_with(other_manager) as (pairs, names):
+        with self._pairs_with(self._objects_of(other_manager)) as (pairs, names):
             distance, pair, data = self._nearest(pairs, names)
         return _join(distance, (return_names, pair), (return_data, data))
 
@@ -276,8 +280,11 @@ class CollisionManager(DeviceMemory):
             return_names: Return the two names too, a tuple in alphabetical order; None if none collide.
 
         Raises:
+            TypeError: transforms is no dictionary.
             ValueError: No object has a name, a transform is not rigid within 1e-6, or turns by half a revolution.
         """
+        if not isinstance(transforms, Mapping):
+            raise TypeError(f"transforms is a {type(transforms).__name__}, not a dictionary of transforms by name")
         ends = np.array(self._placed.poses[: self._placed.scene.object_count]).reshape(-1, 4, 4)
         for name, transform in transforms.items():
             ends[self._slot(name)] = self._matrix(transform, name)

@@ -10,6 +10,8 @@ from warp_abtree.model.files.found import FileSurface, Remarks
 from warp_abtree.model.files.read import USD, read_file, split_file_name
 from warp_abtree.model.mesh import MeshError, load_mesh
 from warp_abtree.model.model import Model
+from warp_abtree.query.result import Result
+from warp_abtree.scene.posed_objects import expect_scene
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.poses import RIGID_TOLERANCE
 
@@ -185,13 +187,15 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
     """
     import trimesh
 
-    count, present = scene.object_count, np.flatnonzero(scene.present).tolist()
+    count, present = expect_scene(scene).object_count, np.flatnonzero(scene.present).tolist()
     if names is None:
         node = dict(zip(present, _distinct(map(scene.name, present))))
     else:
         node = dict(enumerate(names))
         if len(node) != count or len(set(node.values())) != count or not all(isinstance(n, str) for n in node.values()):
             raise ValueError(f"names: not {count} different strings")
+    if result is not None and not isinstance(result, Result):
+        raise TypeError(f"result: a Result is expected, not a {type(result).__name__}")
     if result is not None and len(result.pairs) and int(result.pairs.max()) >= count:
         raise ValueError(f"result: asks object {int(result.pairs.max())}, the scene has {count}")
     hit = {} if result is None else _intersecting_faces(result)

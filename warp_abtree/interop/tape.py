@@ -10,7 +10,7 @@ from warp_abtree.checks.arguments import check_device, wrap_array
 from warp_abtree.kernels.io.pose_gradients import ObjectPairs, gradient_adder
 from warp_abtree.query.stages.distance import DistanceQuery
 from warp_abtree.query.staging import first_rows
-from warp_abtree.state.poses import ANY_NORM, place_rows, view_rows
+from warp_abtree.state.poses import ANY_NORM, IDENTITY_POSE, place_rows, view_rows
 
 # Of each query the pairs that it was given, and where each object stands in them.
 _pairs_of: WeakKeyDictionary = WeakKeyDictionary()
@@ -48,6 +48,10 @@ class PosedDistances:
     """
 
     def __init__(self, query: DistanceQuery, rows: wp.array):
+        if query.batch.removed:  # whose poses are not read
+            rows = wp.clone(rows, requires_grad=False)
+            for i in query.batch.removed:
+                rows[i : i + 1].assign(np.eye(4).reshape(1, 16) if rows.shape[1] == 16 else [IDENTITY_POSE])
         place_rows(rows, query.batch.objects.pool, ANY_NORM)
         query.grow()
         count, found = len(query.given), query.distances

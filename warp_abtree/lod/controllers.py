@@ -25,6 +25,7 @@ from warp_abtree.kernels.lod.ladder import WARP
 from warp_abtree.lod.selection import lod_pool
 from warp_abtree.lod.timing import CostFit
 from warp_abtree.lod.view import Camera, View
+from warp_abtree.scene.posed_objects import expect_scene
 from warp_abtree.state.ladder import Ladder
 from warp_abtree.state.work_lists import full_refit_fraction
 
@@ -167,7 +168,7 @@ class PaperController(Controller):
     def __init__(self, scene, budget_ms, camera=None, threshold_ms=None, steps: int = 50, window: int = 10):
         self.budget_ms = positive(budget_ms, "budget_ms")
         self.threshold = 0.1 * self.budget_ms if threshold_ms is None else positive(threshold_ms, "threshold_ms")
-        super().__init__(scene, camera, window, Ladder(scene.models, steps))
+        super().__init__(scene, camera, window, Ladder(expect_scene(scene).models, steps))
         self.cost = wp.full(1, math.nan, dtype=wp.float64, device=self.device)
         # Case of the last launch, frames it has lasted, frames of the last climb.
         self._case, self.level = self._zeros(3, wp.int32), self._zeros(len(self.lods))
@@ -205,7 +206,7 @@ class ToleranceController(Controller):
         if not value >= 0:
             raise ValueError(f"tolerance {tolerance!r} is below 0")
         self.loosest = check_loosest(loosest)
-        super().__init__(scene, camera, window, Ladder(scene.models, steps, spacing))
+        super().__init__(scene, camera, window, Ladder(expect_scene(scene).models, steps, spacing))
         self.tolerance = wp.full(1, value, dtype=wp.float64, device=self.device)
 
     def _select(self):
@@ -270,7 +271,7 @@ class PredictiveController(Controller):
             raise ValueError(f"low {low!r} and aim {aim!r} do not rise to at most 1")
         self.hold_frames = whole_number(hold_frames, "hold_frames", 0, 2**30)
         self.loosest = check_loosest(loosest)
-        super().__init__(scene, camera, window, Ladder(scene.models, steps, spacing))
+        super().__init__(scene, camera, window, Ladder(expect_scene(scene).models, steps, spacing))
         loosened = int(math.log2(self.loosest) * int(prediction.POSITIONS_PER_OCTAVE))
         self.position_max = int(prediction.DITHER) * (self.pool.tolerance_count - 1) + loosened
         falls = [step for step in FALLS if step > -self.position_max]

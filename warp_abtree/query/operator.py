@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import check_device
+from warp_abtree.checks.arguments import check_device, flag
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
@@ -65,7 +65,7 @@ class Operator(DeviceMemory):
 
     def __init__(self, scene, stages: list[Stage], pairs=None, capacity=None, output="any", sort_pairs=False):
         check_device(scene_or_batch(scene).device, f"making a {type(self).__name__}")
-        room = check_capacity(capacity)
+        room, sort_pairs = check_capacity(capacity), flag(sort_pairs, "sort_pairs")
         self.device, self.regime, self.stages, self.output = scene.device, current_regime(), stages, output
         self.lanes = WARP_SIZE if self.device.is_cuda else 1  # threads of a warp
         with loading(self.device, operator_kernels(self.device, stages, output)):
@@ -333,7 +333,7 @@ class Operator(DeviceMemory):
 
     def run(self, device: bool = False) -> Result:
         """Launch, grow buffers that were too small, and return the whole result, as `result`. Waits for the device."""
-        read = self.readout
+        read, device = self.readout, flag(device, "device")
         first = partial(read.launch_and_bring, self.launch_search) if read.repeats_calls(device) else None
         result = read.make_result(self._grow(partial(read.read_pairs, device), first=first), device)
         result.check()

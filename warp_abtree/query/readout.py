@@ -8,7 +8,7 @@ from weakref import proxy
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import check_device
+from warp_abtree.checks.arguments import check_device, flag
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.io import results as kernels
 from warp_abtree.kernels.search.make_slabs import make_slab_kernel
@@ -94,6 +94,7 @@ class Readout:
 
     def read(self, device: bool, with_rows: bool = True) -> Result:
         """Return the result of the last launch, on any stream, perhaps without what has an entry a hit."""
+        device = flag(device, "device")
         check_device(self.device, "reading results")
         self.operator.check_whole()
         # The default stream waits for those that the query may have been launched on.

@@ -79,9 +79,9 @@ def check_capacity(capacity) -> Buffers:
 
 def check_request(output: str, precision: str):
     """Raise ValueError for an unknown output or precision, or an output that another operator finds."""
-    if output not in (*OUTPUTS, "contacts", "distance"):
+    if not isinstance(output, str) or output not in (*OUTPUTS, "contacts", "distance"):
         raise ValueError(f"output {output!r} is none of 'any', 'count', 'faces', 'contacts', 'distance'")
-    if precision not in _PRECISION_NAMES:
+    if not isinstance(precision, str) or precision not in _PRECISION_NAMES:
         raise ValueError(f"precision {precision!r} is neither 'exact' nor 'float32'")
     others = {"contacts": "ContactQuery", "distance": "DistanceQuery"}
     if output in others:
@@ -97,6 +97,8 @@ def check_options(taken: dict, output: str, precision: str, options: dict) -> di
     given = {name: value for name, value in given.items() if name not in SWITCHES or flag(value, name)}
     if not isinstance(output, str) or output not in taken:
         check_request(output, precision)
+    if not isinstance(precision, str):
+        check_request("faces", precision)
     if output in ("distance", "first_contact") and precision != "exact":
         raise ValueError(f"precision means nothing for output {output!r}")
     for name in given:
@@ -107,11 +109,18 @@ def check_options(taken: dict, output: str, precision: str, options: dict) -> di
     return given
 
 
-def check_gap(gap, pair_count, object_count: int) -> np.ndarray:
-    """Return gaps [world units] as `check_within`: () or (p,) beside given pairs, () or (n,) for the broad phase."""
+def check_gap(gap, pair_count, object_count: int, removed=()) -> np.ndarray:
+    """Return gaps [world units] as `check_within`: () or (p,) beside given pairs, () or (n,) for the broad phase.
+
+    Of objects that were removed nothing is read.
+    """
     if pair_count is not None:
         return check_within(gap, pair_count, "gap")
     known = f"pairs of the broad phase: one for all, or one for each of {object_count} objects"
+    gap = to_numpy(gap, "gap")
+    if len(removed) and gap.shape == (object_count,):
+        gap = gap.copy()
+        gap[removed] = 0
     return check_within(gap, object_count, "gap", known)
 
 

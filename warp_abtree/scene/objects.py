@@ -166,7 +166,10 @@ def check_numbers(values, what: str, low: int, high: int, count: int) -> list[in
 
 def check_bools(values, what: str, count: int) -> list[bool]:
     """Return bools: one for all objects, or (count,); raise ValueError for another shape or type."""
-    flags = np.asarray(values)
+    try:
+        flags = np.asarray(values)
+    except ValueError:  # lists of several lengths
+        flags = np.empty(())
     if flags.ndim == 0 or flags.dtype != bool:
         return [flag(values, what)] * count
     if flags.shape != (count,):

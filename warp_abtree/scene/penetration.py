@@ -7,8 +7,8 @@ boxes are along d; by more where `FirstContactQuery` leaves a pair undecided. Th
 pose that is moved so rounds.
 
 The least depth over the directions bounds the translational penetration depth of the pair from above. Directions are
-those given, or both ways along the mean normal of the contacts and the axes of the smaller object's box, and the axes,
-edge and corner diagonals of a cube in the world.
+those given, or both ways along the mean normal of the contacts and the axes of the smaller object's box, of equal ones
+that with the higher index, and the axes, edge and corner diagonals of a cube in the world.
 """
 
 from dataclasses import dataclass
@@ -92,7 +92,8 @@ class _PosedBoxes:
 
     def default_directions(self, pairs, normals) -> np.ndarray:
         """Return both ways along mean normals and the axes of the smaller objects, and those of a cube, (p, 34, 3)."""
-        smaller = np.where(self.size[pairs[:, 0]] < self.size[pairs[:, 1]], *pairs.T)
+        lower, higher = pairs.min(1), pairs.max(1)
+        smaller = np.where(self.size[lower] < self.size[higher], lower, higher)
         normals, axes = normals[:, None], self.rotation[smaller].transpose(0, 2, 1)
         cube = np.broadcast_to(CUBE_DIRECTIONS, (len(pairs), *CUBE_DIRECTIONS.shape))
         return _unit(np.concatenate([normals, -normals, axes, -axes, cube], 1))

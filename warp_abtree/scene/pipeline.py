@@ -16,6 +16,7 @@ from warp_abtree.query.request import CapacityError, check_capacity
 from warp_abtree.query.result import Result
 from warp_abtree.query.stages.contacts import ContactQuery
 from warp_abtree.query.stages.intersect import Query
+from warp_abtree.scene.posed_objects import expect_scene
 from warp_abtree.state.device_update import NO_FAULTS, DeviceLodUpdate, LevelStates
 from warp_abtree.state.generation import STALE_GRAPH
 from warp_abtree.state.poses import QUATERNION_TOLERANCE
@@ -105,7 +106,7 @@ class Pipeline(DeviceMemory):
     """
 
     def __init__(self, scene, output="any", groups=None, ladder=None, **request):
-        check_device(scene.device, "making a Pipeline")
+        check_device(expect_scene(scene).device, "making a Pipeline")
         self.batch = batch = scene.batch().with_own_states()
         self.device = batch.device
         if groups is not None and ladder is not None:
@@ -136,7 +137,7 @@ class Pipeline(DeviceMemory):
         group = np.arange(len(lods)) if groups is None else check_groups(groups, object_model)
         first = np.unique(group, return_index=True)[1]
         batch.replace_states(list(zip(object_model[first].tolist(), lods[first].tolist())), group)
-        return DeviceLodUpdate(batch.models, batch.states)
+        return DeviceLodUpdate(batch.models, batch.states, takes_any=group[batch.removed])
 
     def _make_ladder(self, lods, ladder, models):
         """Make a state a model and level."""

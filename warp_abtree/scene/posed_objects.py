@@ -9,6 +9,7 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, to_numpy, whole_number
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.quaternions import quaternions_of
+from warp_abtree.kernels.base.arrays import NO_OBJECT
 from warp_abtree.model.model import Model
 from warp_abtree.scene.objects import ALL_BITS, ObjectList, check_columns, check_lods, check_models
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
@@ -260,7 +261,9 @@ class PosedObjects(DeviceMemory):
             models = ModelArrays(self.models, self.device)
             states = StateArrays(models, self.device)
             told = self._objects
-            objects = ObjectArrays(told.world, told.static, self.device, told.collision_bits())
+            statics = np.array(told.static, np.int32)
+            statics[told.free] = NO_OBJECT
+            objects = ObjectArrays(told.world, statics, self.device, told.collision_bits())
             batch = Batch(models, states, objects, told.model, self._excluded, told.solid, told.free, told.name)
             batch.set_lods(np.array(told.lod))
             told.set_poses(objects.pool, self.device)
@@ -329,3 +332,10 @@ class PosedObjects(DeviceMemory):
             i = int(bad[0])
             raise ValueError(f"lods: object {i} asks for LOD {lods[i]}, outside 0 .. {top[i]}")
         return self.batch().set_lods(lods.astype(np.int64))
+
+
+def expect_scene(scene) -> Any:
+    """Return a scene; raise TypeError for anything else."""
+    if not isinstance(scene, PosedObjects):
+        raise TypeError(f"scene: a Scene is expected, not a {type(scene).__name__}")
+    return scene

@@ -12,6 +12,7 @@ from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.bodies import bodies as kernels
 from warp_abtree.model.model import Model
+from warp_abtree.scene.posed_objects import expect_scene
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.poses import check_poses, launch_place
 
@@ -21,7 +22,10 @@ FIRST_STEP = 1 / 60
 
 def object_mask(chosen, count):
     """Return which objects are chosen by indices or by a mask, bool (count,)."""
-    chosen = np.asarray(chosen)
+    try:
+        chosen = np.asarray(chosen)
+    except ValueError as error:  # lists of several lengths
+        raise ValueError(f"kinematic: {first_line(error)}") from None
     if chosen.dtype == bool and chosen.shape == (count,):
         return chosen.copy()
     mask = np.zeros(count, bool)
@@ -107,13 +111,15 @@ class RigidBodies(DeviceMemory):
     """
 
     def __init__(self, scene: Scene, gravity, kinematic, velocity, angular_velocity):
-        self.scene, self.device, n = scene, scene.device, scene.object_count
+        self.scene, self.device, n = expect_scene(scene), scene.device, scene.object_count
         self._pool = pool = scene.batch().objects.pool
         self.gravity = finite_array(gravity, "gravity", (3,))
         self.kinematic = object_mask(kinematic, n)
         self.rigid = ~self.kinematic & (pool.is_static.numpy() == 0)
-        velocity = broadcast_rows(velocity, "velocity", (n, 3))
-        angular_velocity = broadcast_rows(angular_velocity, "angular_velocity", (n, 3))
+        velocity, angular_velocity = (
+            broadcast_rows(values, name, (n, 3), unread=scene.batch().removed)
+            for name, values in (("velocity", velocity), ("angular_velocity", angular_velocity))
+        )
         models = sorted({scene.object_model[i] for i in np.flatnonzero(self.rigid)})
         found = {m: mass_properties(scene.models[m]) for m in models}
         own = [found[m] if r else IMMOVABLE for m, r in zip(scene.object_model, self.rigid)]
@@ -159,7 +165,7 @@ class RigidBodies(DeviceMemory):
 
     def set_targets(self, targets):
         """Set the poses of kinematic objects at the end of the next step; see `Dynamics.step`."""
-        targets = check_poses(targets, "targets")
+        targets = check_poses(targets, "targets", removed=self.scene.batch().removed)
         if len(targets) != len(self.mass):
             raise ValueError(f"targets: {len(targets)} given for {len(self.mass)} objects")
         rows = wp.array(targets.reshape(len(targets), -1), dtype=wp.float64, device=self.device)

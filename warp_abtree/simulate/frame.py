@@ -23,6 +23,7 @@ from warp_abtree.lod.controllers import Controller, Feedback
 from warp_abtree.lod.timing import Timer
 from warp_abtree.query.request import check_request
 from warp_abtree.query.result import Result
+from warp_abtree.scene.posed_objects import expect_scene
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.budget_report import summarise_rows
 from warp_abtree.simulate.frame_file import FrameFile
@@ -77,6 +78,8 @@ class OpenFrame:
 
 def check_motion(motion, scene: Scene):
     """Raise ValueError for a motion of another number of objects, or of bodies of another scene."""
+    if motion is not None and not hasattr(type(motion), "__len__"):
+        raise TypeError(f"motion: a {type(motion).__name__} is no motion of so many objects")
     if motion is not None and len(motion) != scene.object_count:
         raise ValueError(f"the motion is of {len(motion)} objects, the scene has {scene.object_count}")
     if isinstance(motion, SteppedMotion) and motion.dynamics.scene is not scene:
@@ -124,12 +127,12 @@ class Frame(DeviceMemory):
         time_step: float = 1 / 60,
         clock: Callable[[], float] | None = None,
     ):
-        check_motion(motion, scene)
+        check_motion(motion, expect_scene(scene))
         if not (lods is None or callable(lods) or isinstance(lods, Controller)):
             raise ValueError(f"lods: a {type(lods).__name__} is neither a controller nor a function of time")
         if not (clock is None or callable(clock)):
             raise ValueError(f"clock: a {type(clock).__name__} cannot be called")
-        check_request("faces" if output == "contacts" else output, "exact")
+        check_request("faces" if isinstance(output, str) and output == "contacts" else output, "exact")
         self.scene, self.motion, self.lods, self.output = scene, motion, lods, output
         self.time_step = positive(time_step, "time_step")
         self.history: list[FrameRow] = []

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_abtree.checks.arguments import broadcast_rows
+from warp_abtree.checks.arguments import broadcast_rows, to_numpy
 from warp_abtree.checks.quaternions import multiply_quaternions, quaternions_about
 from warp_abtree.state.poses import check_poses
 
@@ -50,7 +50,7 @@ class Kinematic:
     phase: Any = 0.0
 
     def __post_init__(self):
-        self.position = np.array(self.position, np.float64)
+        self.position = to_numpy(self.position, "position").astype(np.float64)
         if self.position.ndim != 2 or self.position.shape[1] != 3:
             raise ValueError(f"position: shape {self.position.shape}, not (n, 3)")
         n = len(self.position)

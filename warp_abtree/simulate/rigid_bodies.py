@@ -218,7 +218,12 @@ class Dynamics(RigidBodies):
         """Move all bodies by one step. Launches only: after a `step`, a CUDA graph can capture it, with this dt.
 
         Where contacts or pairs outrun the capacity nothing moves; `check` raises then.
+
+        Raises:
+            ValueError: A step that is not above 0.
+            RuntimeError: As `step`.
         """
+        dt = positive(dt, "dt")
         self._check_whole()
         with self.query.guard.launching(self):
             self.query.launch()

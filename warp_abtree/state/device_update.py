@@ -23,12 +23,15 @@ class DeviceLodUpdate(WorkLists):
     The worklists have room for the worst case: every state of a pool that grows no more moves, or those of some ids, by
     the longest slice that is not refitted whole. From the first launch on, LODs are known on the device only.
 
+    Args:
+        takes_any: States of which no LOD that is wanted is a fault, those of places without an object.
+
     Attributes:
         wanted: LOD of each state, device int32 (s,), to be written before a launch.
         faults: LODs wanted out of range (the nearer end is taken) and the lowest state that had one, device int32 (2,).
     """
 
-    def __init__(self, models: ModelArrays, states: StateArrays, moving=None):
+    def __init__(self, models: ModelArrays, states: StateArrays, moving=None, takes_any=()):
         self.models, self.states = models, states
         device = states.device
         owner = np.array([slot.model for slot in states.slots])[slice(None) if moving is None else moving]
@@ -61,6 +64,7 @@ class DeviceLodUpdate(WorkLists):
         lengths |= dict.fromkeys(("changed_count", "marked_count"), len(states.slots))
         lengths |= {"whole_count": int(LEVEL_MAX), "whole_state": int(whole_room.sum())}
         rooms = {name: np.zeros(length, np.int32) for name, length in lengths.items()}
+        rooms["takes_any"] = np.isin(np.arange(len(states.slots)), takes_any).astype(np.int32)
         plan = struct_of(work_lists.UpdateLists, device, whole_start=np.cumsum(whole_room) - whole_room, **rooms)
         make_level_lists(plan, marked_room, device)
         self.wanted = wp.array([slot.lod for slot in states.slots], dtype=wp.int32, device=device)

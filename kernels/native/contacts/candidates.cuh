@@ -13,7 +13,7 @@ struct CandidateWriter {
     const Objects& objects;
     const Witnesses& witnesses;
     wp::int32 a, w;
-    double least;
+    double least, slack;  // depth of the least deep corner; one that lacks no more than `slack` counts as so deep
     int place;
 
     CUDA_CALLABLE void write_normal(const C::Point& n) const {
@@ -25,21 +25,21 @@ struct CandidateWriter {
             witnesses.depth.data[(wp::int64)COLUMN_CORNERS * w + place] = NAN;
     }
     CUDA_CALLABLE void offer(const C::Point& point, double depth, bool exists) {
-        if (!exists || depth < least || place == COLUMN_CORNERS)
+        if (!exists || depth < least - slack || place == COLUMN_CORNERS)
             return;
         const wp::int64 k = (wp::int64)COLUMN_CORNERS * w + place++;
-        witnesses.depth.data[k] = depth;
+        witnesses.depth.data[k] = C::greater(depth, least);
         witnesses.point.data[k] = vector_of(C::pose(objects.rotation.data[a].data, objects.position.data[a], point));
     }
 };
 
 template <class Objects, class Pair, class Witnesses>
 CUDA_CALLABLE bool find_crossing(const Objects& objects, const Pair& pair, wp::vec3d loop, bool has_area,
-                                 wp::float64 gap, wp::int32 w, const Witnesses& witnesses) {
+                                 wp::float64 gap, wp::float64 scale, wp::int32 w, const Witnesses& witnesses) {
     typedef OneCrossing C;
-    const C::Crossing contact = crossing_of(objects, pair, loop, has_area, gap);
+    const C::Crossing contact = crossing_of(objects, pair, loop, has_area, gap, scale);
     const C::Measured best = contact.measure();
-    CandidateWriter<Objects, Witnesses> writer = {objects, witnesses, pair.object, w, contact.least, 0};
+    CandidateWriter<Objects, Witnesses> writer = {objects, witnesses, pair.object, w, contact.least, best.slack, 0};
     writer.write_normal(best.normal);
     const bool has_depth = best.depth > C::no_depth();
     if (has_depth)
@@ -47,19 +47,27 @@ CUDA_CALLABLE bool find_crossing(const Objects& objects, const Pair& pair, wp::v
     return has_depth;
 }
 
+template <class Objects, class Pair>
+CUDA_CALLABLE wp::int32 touching_faces(const Objects& objects, const Pair& pair, wp::float64 scale) {
+    const OneCrossing::Crossing faces = crossing_of(objects, pair, pair.normal_a, false, 0.0, scale);
+    return (faces.first_touches(faces.shallow) ? 1 : 0) + (faces.second_touches(faces.shallow) ? 2 : 0);
+}
+
 template <class Objects, class Pair, class Witnesses>
 CUDA_CALLABLE bool find_facing(const Objects& objects, const Pair& pair, wp::float64 gap, wp::float64 separation,
-                               wp::int32 w, const Witnesses& witnesses) {
+                               wp::int32 touching, wp::int32 w, const Witnesses& witnesses) {
     typedef OneCrossing C;
     const C::Faces faces = faces_of(pair);
     const auto& rotation = objects.rotation.data[pair.object].data;
     const C::Point normal_a = C::turn_back(rotation, point_of(pair.normal_a));
     const C::Point normal_b = C::turn_back(rotation, point_of(pair.normal_b));
     const double slack = C::greater(ALIKE * separation, C::find_slack(faces));
-    C::Measured best = {normal_a, C::no_depth()};
+    C::Measured best = {normal_a, C::no_depth(), 0.0};
     // A gap wider than the distance stays so whatever the other normal says.
 #pragma unroll 1
-    for (int k = 0; k < 2 && (best.depth == C::no_depth() || -best.depth - separation <= slack); ++k) {
+    for (int k = touching == 2; k < 2 && (best.depth == C::no_depth() || -best.depth - separation <= slack); ++k) {
+        if (k == 1 && touching == 1)
+            break;
         const C::Point n = C::choose(k == 0, normal_a, C::negate(normal_b));
         const C::Measured found = C::measure(faces, n, normal_a, normal_b, -gap);
         if (best.depth == C::no_depth() || (found.depth > C::no_depth() && found.depth < best.depth))
@@ -67,7 +75,7 @@ CUDA_CALLABLE bool find_facing(const Objects& objects, const Pair& pair, wp::flo
     }
     const bool serves = fabs(fabs(best.depth) - separation) <= slack;
     if (serves) {
-        CandidateWriter<Objects, Witnesses> writer = {objects, witnesses, pair.object, w, -gap, 0};
+        CandidateWriter<Objects, Witnesses> writer = {objects, witnesses, pair.object, w, -gap, 0.0, 0};
         witnesses.nearest_only.data[w] = best.depth > slack;
         writer.write_normal(best.normal);
         writer.write_corners(C::Column(faces, best.normal, normal_a, normal_b));

@@ -7,6 +7,10 @@
 
 // A face's own normal serves in place of the loop's within 60 degrees of it.
 constexpr double LIKENESS = 0.5;
+// Cosine under which normals differ by more than rounding.
+constexpr double ALONG = 0.998;
+// Distance and depth, at unit size, under which faces touch.
+constexpr double NO_DISTANCE = 0x1p-30;
 // More than any, in offers to slots.
 constexpr float NO_DEPTH_SEPARATION = 0x1p60f;
 
@@ -31,15 +35,18 @@ struct Crossings : Columns<Number> {
         Point normal_a, normal_b, loop;  // unit normals of the faces, and of the contact's loop
         bits has_area;                   // whether that is the normal of an area
         lanes least;  // depth from which on there are candidates: 0, or minus the gap where faces look at one another
+        double shallow;  // depth under which faces touch
 
-        // Of normals in the world, turned into A's frame, and of a gap, 0 for none.
+        // Of normals in the world, turned into A's frame, of a gap, 0 for none, and of the scale to unit size.
         CUDA_CALLABLE Crossing(const Faces& faces, const double (&rotation)[3][3], const Point& world_a,
-                               const Point& world_b, const Point& world_loop, const bits& has_area, double gap)
+                               const Point& world_b, const Point& world_loop, const bits& has_area, double gap,
+                               double scale)
             : faces(faces),
               normal_a(C::turn_back(rotation, world_a)),
               normal_b(C::turn_back(rotation, world_b)),
               loop(C::turn_back(rotation, world_loop)),
-              has_area(has_area) {
+              has_area(has_area),
+              shallow(NO_DISTANCE / scale) {
             least = -dot(world_a, world_b) >= LIKENESS ? lanes{} - gap : lanes{};
         }
         // Whether a face lies in front of the plane through u whose normal is n.
@@ -48,30 +55,38 @@ struct Crossings : Columns<Number> {
             const lanes x = dot(n, minus(v[0], u)), y = dot(n, minus(v[1], u)), z = dot(n, minus(v[2], u));
             return (lesser(x, lesser(y, z)) >= -slack) & (dot(n, n) > 0.0);
         }
+        // Whether the second face lies in front of the first one, and the first in front of the second.
+        CUDA_CALLABLE bits first_touches(const lanes& slack) const {
+            return lies_in_front(normal_a, faces.a[0], faces.b, slack);
+        }
+        CUDA_CALLABLE bits second_touches(const lanes& slack) const {
+            return lies_in_front(normal_b, faces.b[0], faces.a, slack);
+        }
         // Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap
         // least; of both faces' normals where neither is like it and one looks the other way. Where faces merely touch,
         // the normal of a face that has the other in front serves, if it is like the loop's or that has no area, as
-        // rounding may have made it; edges beside one another have none then.
+        // rounding may have made it; edges beside one another have none then. Where faces are hardly in one another, a
+        // face's normal that rounding alone makes as good as the loop's serves only if the other face lies in front.
+        // Depths of corners may lack as much as `Measured` says.
         CUDA_CALLABLE Measured measure() const {
             const lanes slack = C::find_slack(faces), toward_a = dot(loop, normal_a), toward_b = -dot(loop, normal_b);
-            const bits any_loop = negate(has_area);
-            const bits touches_a =
-                lies_in_front(normal_a, faces.a[0], faces.b, slack) & (any_loop | (toward_a > LIKENESS));
-            const bits touches_b =
-                lies_in_front(normal_b, faces.b[0], faces.a, slack) & (any_loop | (toward_b > LIKENESS));
-            const bits touches = touches_a | touches_b;
-            const bits none = touches_a & touches_b & (-dot(normal_a, normal_b) < LIKENESS);
+            const bits opposed = -dot(normal_a, normal_b) >= LIKENESS, any_loop = negate(has_area) & opposed;
+            const lanes like = has_area ? lanes{} + LIKENESS : lanes{} + FACING;
+            const bits touches_a = first_touches(slack) & (any_loop | (toward_a > like));
+            const bits touches_b = second_touches(slack) & (any_loop | (toward_b > like));
+            const bits touches = touches_a | touches_b, none = touches_a & touches_b & negate(opposed);
+            const bits first_a = touches_a & negate(touches_b & (toward_a < ALONG * toward_b));
             // A loop that runs all round a part in another, as round a thread, has no one way out.
             const lanes toward = greater(toward_a, toward_b);
             const bits contrary = (toward >= FACING) & (toward <= LIKENESS) & (lesser(toward_a, toward_b) < -FACING);
             // Of columns only normals and depths are kept: a second one beside the first does not fit into registers.
-            Measured best = {loop, C::no_depth()};
+            Measured best = {loop, C::no_depth(), touches & (least == 0.0) ? slack : lanes{}};
 #pragma unroll 1
             for (int k = 0; k < 3; ++k) {
                 Point n = k == 1 ? normal_a : negate(normal_b);
                 bits tried = negate(touches) & (contrary | (dot(n, loop) > LIKENESS)), tight = negate(bits{});
                 if (k == 0) {
-                    n = choose(touches, choose(touches_a, normal_a, n), loop);
+                    n = choose(touches, choose(first_a, normal_a, n), loop);
                     tried = negate(none);
                     tight = touches;
                 }
@@ -79,9 +94,13 @@ struct Crossings : Columns<Number> {
                     continue;
                 const lanes depth =
                     C::measure(faces, n, normal_a, normal_b, tight ? lesser(least, -slack) : least).depth;
-                const bits closer = (best.depth < -slack) | (depth <= best.depth + slack);
+                // Rounding does not tell a face that the other one cuts from one that it touches.
+                bits sure = best.depth >= shallow;
+                if (k > 0 && Number::any(negate(sure)))
+                    sure = sure | (k == 1 ? first_touches(lanes{} + shallow) : second_touches(lanes{} + shallow));
+                const bits closer = (best.depth < -slack) | (depth <= best.depth + (sure ? slack : -slack));
                 const bits better = k == 0 ? tried : tried & (depth >= -slack) & closer;
-                best = Measured{choose(better, n, best.normal), better ? depth : best.depth};
+                best = Measured{choose(better, n, best.normal), better ? depth : best.depth, best.slack};
             }
             return best;
         }
@@ -127,7 +146,7 @@ struct CrossingRate {
                                const typename C::Measured& best)
         : view(view),
           has_depth(best.depth > C::no_depth()),
-          least(contact.least),
+          least(contact.least - best.slack),
           scores(find_bin(view, best.normal), view.directions) {
         const lanes zero = {};
         if (Number::any(C::negate(has_depth)))  // behind whatever has a depth
@@ -155,15 +174,15 @@ CUDA_CALLABLE OneCrossing::Faces faces_of(const Pair& pair) {
 
 template <class Objects, class Pair>
 CUDA_CALLABLE OneCrossing::Crossing crossing_of(const Objects& objects, const Pair& pair, const wp::vec3d& loop,
-                                                bool has_area, double gap) {
+                                                bool has_area, double gap, double scale) {
     return OneCrossing::Crossing(faces_of(pair), objects.rotation.data[pair.object].data, point_of(pair.normal_a),
-                                 point_of(pair.normal_b), point_of(loop), has_area, gap);
+                                 point_of(pair.normal_b), point_of(loop), has_area, gap, scale);
 }
 
 template <class Trees, class PairPose, class Pair, class Slots>
 CUDA_CALLABLE void offer_crossing(const Trees& trees, const PairPose& pose, const Pair& pair, wp::vec3d loop,
                                   bool has_area, wp::float64 gap, wp::int32 place, wp::int32 p, const Slots& slots) {
-    const OneCrossing::Crossing contact = crossing_of(trees.objects, pair, loop, has_area, gap);
+    const OneCrossing::Crossing contact = crossing_of(trees.objects, pair, loop, has_area, gap, pose.scale);
     const OneCrossing::Measured best = contact.measure();
     const SlotView view = view_pair(trees, pose, pair.object, p, slots);
     const CrossingRate<Number64> rated(view, contact, best);

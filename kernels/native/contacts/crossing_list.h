@@ -31,7 +31,8 @@ void simd_offer_crossing(const Trees& trees, const PairPose& pose, wp::int32 a, 
         else
             corners.load(hit, count, f.a, f.b);
         const C::Crossing contact(f, trees.objects.rotation.data[a].data, load(contacts.normal_a.data + first, count),
-                                  load(contacts.normal_b.data + first, count), load(loop, count), has_area, gap);
+                                  load(contacts.normal_b.data + first, count), load(loop, count), has_area, gap,
+                                  pose.scale);
         const CrossingRate<Lanes64> rated(view, contact, contact.measure());
         const SlotKeys<Lanes64::floats, Lanes64::float_bits, Lanes64::integers> keys(rated.scores, 32);
         for (int k = 0; k < count; ++k)

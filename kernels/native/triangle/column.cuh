@@ -182,9 +182,10 @@ struct Columns : Points64<Number> {
     struct Measured {
         Point normal;
         lanes depth;
+        lanes slack;  // that depths of corners may lack
     };
     static CUDA_CALLABLE Measured measure(const Faces& f, const Point& n, const Point& normal_a, const Point& normal_b,
                                           const lanes& least) {
-        return Measured{n, Column(f, n, normal_a, normal_b).find_depth(least)};
+        return Measured{n, Column(f, n, normal_a, normal_b).find_depth(least), lanes{}};
     }
 };

@@ -314,7 +314,7 @@ class DistanceQuery(Operator):
     _distance: Any
 
     def __init__(self, scene, pairs=None, capacity=None, tolerance=0.0, relative=0.0, beyond=None, signed=False):
-        count = None if pairs is None else len(to_numpy(pairs, "pairs"))
+        count = None if pairs is None else len(np.atleast_1d(to_numpy(pairs, "pairs")))
         stages = self.plan(check_tolerances(tolerance, relative), check_beyond(beyond, count), signed)
         *_, self._distance = stages
         self.distances, self._signed = self._distance.distances, signed

@@ -165,7 +165,7 @@ class GapStage(Stage):
         elif isinstance(gap, wp.array) and gap.shape == (count,) and gap.dtype is wp.vec4d:
             self._reach = gap
         else:
-            parts, rows = check_gap(gap, None, count), np.zeros((count, 4))
+            parts, rows = check_gap(gap, None, count, operator.batch.removed), np.zeros((count, 4))
             rows[:, 3] = 0.5 * parts if parts.ndim == 0 else parts
             self._reach = wp.array(rows, dtype=wp.vec4d, device=operator.device)
 

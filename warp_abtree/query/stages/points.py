@@ -17,7 +17,8 @@ apart but nearer are offered in float32; the winners are measured in float64, an
 * Faces that are apart have minus a separation as depth (`kernels.contacts.near_points`). Where they look at one another
   within 60 degrees all corners within the column count, along whichever normal leaves the wider gap, if that is the
   distance; else, as across edges, the middle of the nearest points. A face behind the other's plane is inside, as deep
-  as it is far.
+  as it is far. Nearer than 2^-30 of the sizes, where rounding tells directions, a face's normal serves that has the
+  other face in front.
 * Edges and what is inside count only if a tree search finds no other face nearer. Contacts at edges that nearer faces
   cover are left out on purpose: edges between the faces of a floor would stop what slides past.
 
