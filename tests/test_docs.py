@@ -13,6 +13,7 @@ import pytest
 import trimesh
 import trimesh.collision
 import warp as wp
+from conftest import slow
 from helpers import refused
 
 from bench import __main__ as bench
@@ -134,13 +135,10 @@ def run_python(page, needs, block, line, space):
 
 
 RUN = [page for page in PAGES if {kind for _, kind, *_ in blocks_of(page)} & {"python", "toml", "sh"}]
+assert len(RUN) > 15 and RUN[0].name == "README.md", "blocks are found"
 
 
-@pytest.mark.parametrize(
-    "page",
-    [pytest.param(page, marks=() if page.name == "README.md" else pytest.mark.slow) for page in RUN],
-    ids=name_of,
-)
+@pytest.mark.parametrize("page", [RUN[0], *slow(*RUN[1:])], ids=name_of)
 def test_pages_run_as_they_stand(page, tmp_path, monkeypatch):
     """Python, scene files and commands, in their order in a folder; what installs packages is left to .ci/run."""
     monkeypatch.chdir(tmp_path)
