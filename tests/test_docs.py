@@ -13,6 +13,7 @@ import pytest
 import trimesh
 import trimesh.collision
 import warp as wp
+from conftest import slow
 from helpers import refused
 
 from bench import __main__ as bench
@@ -33,70 +34,20 @@ def name_of(page):
     return page.relative_to(ROOT).as_posix()
 
 
-def blocks_of(page, language):
-    """Return (what a block needs, its text) of every block of a language, smaller where `SMALLER` says so."""
+def blocks_of(page):
+    """Yield (what a block needs, its language, its text, its first line) of a page, smaller where `SMALLER` says so."""
     text = page.read_text(encoding="utf-8")
     for old, new in SMALLER.get(name_of(page), ()):
         assert old in text, f"{name_of(page)} no longer holds {old!r}"
         text = text.replace(old, new)
-    return [
-        (needs.split(", ") if needs else [], block) for needs, kind, block in BLOCK.findall(text) if kind == language
-    ]
+    for match in BLOCK.finditer(text):
+        yield match[1].split(", ") if match[1] else [], match[2], match[3], text[: match.start(3)].count("\n")
 
 
 def missing(needs):
     """Return what of a block's needs is not here: modules, or "cuda"."""
     here = {"cuda": wp.is_cuda_available()}
     return [need for need in needs if not here.get(need, need != "cuda" and importlib.util.find_spec(need) is not None)]
-
-
-PYTHON = [(page, i) for page in PAGES for i in range(len(blocks_of(page, "python")))]
-
-
-@pytest.fixture(scope="module")
-def run_block(tmp_path_factory):
-    """Return a function that runs a block after those before it on its page, all in one namespace."""
-    spaces, done = {}, {}
-
-    def run(page, index):
-        space = spaces.setdefault(page, {})
-        for i, (needs, block) in enumerate(blocks_of(page, "python")[: index + 1]):
-            if i < done.get(page, 0):
-                continue
-            done[page] = i + 1
-            if not missing(needs):
-                # Line numbers of the page, for a traceback that can be read.
-                start = page.read_text(encoding="utf-8").split("```python\n")[: i + 1]
-                lines = sum(part.count("\n") + 1 for part in start)
-                exec(compile("\n" * lines + block, name_of(page), "exec"), space)
-
-    folder = tmp_path_factory.mktemp("docs")
-    (folder / "scenes").symlink_to(ROOT / "scenes")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        yield run
-
-
-@pytest.mark.parametrize(("page", "index"), PYTHON, ids=[f"{name_of(page)}-{i + 1}" for page, i in PYTHON])
-@pytest.mark.slow
-def test_python_blocks_run(run_block, page, index):
-    needs, block = blocks_of(page, "python")[index]
-    absent = missing([*needs, *(["pxr"] if "warp:" in block else [])])
-    if absent:
-        pytest.skip(f"needs {', '.join(absent)}")
-    shown = io.StringIO()
-    with contextlib.redirect_stdout(shown):
-        run_block(page, index)
-    assert bool(shown.getvalue()) >= ("print(" in block)
-
-
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks_of(page, "toml")], ids=name_of)
-@pytest.mark.slow
-def test_scenes_in_pages_load(page):
-    for _, text in blocks_of(page, "toml"):
-        loaded = load_scene(page, device="cpu", text=text)
-        rows = loaded.frame(output="count").run(2)
-        assert rows[-1].objects == loaded.scene.object_count > 1
 
 
 def test_keys_of_scene_files_are_listed_as_they_are():
@@ -136,20 +87,14 @@ def test_bounds_are_numbered_once_and_cited():
     assert cited == set(numbered)
 
 
-def commands_of(page):
-    """Yield the words of every `warp-abtree` command in the shell blocks of a page, without its name."""
-    for _, text in blocks_of(page, "sh"):
-        for line in text.splitlines():
-            if "warp-abtree " in line and "--print-completion" not in line:
-                yield line.split("warp-abtree ", 1)[1].split("#")[0].split()
-
-
 # Commands that are not run here, and why.
 NOT_RUN = {"view": "serves until it is stopped; tests/app/test_view_page.py", "bench": "a study; tests/bench"}
 
 
 def run_words(words):
     """Run a command of a page at small cost, on the CPU; return why it was not run, or None."""
+    if "--print-completion" in words:
+        return "a script of a shell"
     assert cli.make_parser().parse_args(words).command == words[0]
     assert all((ROOT / word).is_file() for word in words if word.startswith("scenes/"))
     if words[0] in NOT_RUN:
@@ -180,44 +125,37 @@ def run_words(words):
     return None
 
 
-def run_page(page, folder):
-    """Run a page's commands in a folder, after the Python and the files before them; return why some were not run.
-
-    What installs packages, over the network, is left to .ci/run.
-    """
-    skipped, space = [], {}
-    for needs, kind, block in BLOCK.findall(page.read_text(encoding="utf-8")):
-        if kind == "toml" and (name := re.match(r"# (\w+\.toml)\n", block)):
-            (folder / name[1]).write_text(block)
-        elif (
-            kind == "python"
-            and re.search(r"\.(save|export)\(", block)
-            and not missing(needs.split(", ") if needs else [])
-        ):
-            exec(block, space)
-        elif kind == "sh":
-            parts = [part.split("#")[0].split() for line in block.splitlines() for part in line.split("&&")]
-            for words in parts:
-                if words and words[0].removeprefix(".venv/bin/") == "warp-abtree":
-                    skipped.append(run_words(words[1:]))
-    return skipped
+def run_python(page, needs, block, line, space):
+    """Run a block in the namespace of those before it on its page, where what it needs is here."""
+    shown = io.StringIO()
+    if not missing([*needs, *(["pxr"] if "warp:" in block else [])]):
+        with contextlib.redirect_stdout(shown):
+            exec(compile("\n" * line + block, name_of(page), "exec"), space)
+        assert bool(shown.getvalue()) >= ("print(" in block)
 
 
-@pytest.mark.parametrize(
-    "page",
-    [
-        pytest.param(page, marks=() if page.name == "README.md" else pytest.mark.slow, id=name_of(page))
-        for page in PAGES
-        if any(commands_of(page))
-    ],
-)
-def test_commands_run_as_they_stand(page, tmp_path, monkeypatch):
+RUN = [page for page in PAGES if {kind for _, kind, *_ in blocks_of(page)} & {"python", "toml", "sh"}]
+assert len(RUN) > 15 and RUN[0].name == "README.md", "blocks are found"
+
+
+@pytest.mark.parametrize("page", [RUN[0], *slow(*RUN[1:])], ids=name_of)
+def test_pages_run_as_they_stand(page, tmp_path, monkeypatch):
+    """Python, scene files and commands, in their order in a folder; what installs packages is left to .ci/run."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
-    reasons = run_page(page, tmp_path)
-    assert reasons
-    if None not in reasons:
-        pytest.skip("; ".join(dict.fromkeys(reasons)))
+    space = {}
+    for needs, kind, block, line in blocks_of(page):
+        if kind == "python":
+            run_python(page, needs, block, line, space)
+        elif kind == "toml":
+            if name := re.match(r"# (\w+\.toml)\n", block):
+                (tmp_path / name[1]).write_text(block)
+            loaded = load_scene(page, device="cpu", text=block)
+            assert loaded.frame(output="count").run(2)[-1].objects == loaded.scene.object_count > 1
+        elif kind == "sh":
+            for words in [part.split("#")[0].split() for text in block.splitlines() for part in text.split("&&")]:
+                if words and words[0].removeprefix(".venv/bin/") == "warp-abtree":
+                    run_words(words[1:])
 
 
 @pytest.mark.slow
@@ -264,7 +202,7 @@ def test_samples_run_and_stand_in_their_pages(path):
     text = path.read_text(encoding="utf-8")
     lines, (page,) = text.splitlines(), re.findall(r"docs/\w+\.md", text)
     assert len(lines) <= 40 and f"python scenes/{path.name}" in lines[0]
-    assert blocks_of(ROOT / page, "python")[0] == ([], text.split("\n\n", 1)[1])
+    assert next(block for _, kind, block, _ in blocks_of(ROOT / page) if kind == "python") == text.split("\n\n", 1)[1]
     picture = f"sample_{path.stem.split('_', 1)[1]}.png"
     assert f"]({picture})" in (ROOT / page).read_text(encoding="utf-8")
     assert (ROOT / "docs" / picture).stat().st_size < 150_000

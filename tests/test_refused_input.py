@@ -33,19 +33,6 @@ def test_a_number_of_objects_is_whole_and_above_0(tmp_path):
     assert loaded.scene.object_count == 5
 
 
-@pytest.mark.parametrize("words", ["nosuch", "--device cpu nosuch", "query --nosuch", "--device cpu paper"], ids=str)
-def test_a_benchmark_that_there_is_not(capsys, words):
-    pytest.importorskip("bench")
-    with pytest.raises(SystemExit) as caught:
-        raise SystemExit(main(["bench", *words.split()]))
-    (line,) = capsys.readouterr().err.splitlines()
-    assert caught.value.code == 2
-    if words.split()[-1] == "nosuch":
-        assert all(f"'{name}'" in line for name in ("paper", "tradeoff", "query", "update"))
-    if words.endswith("cpu paper"):
-        assert "before its options" in line
-
-
 def refuse(name, make, *values):
     """Yield calls of a maker by a name that must be in the error, one a bad value."""
     yield from ((name, lambda value=value: make(value)) for value in values)

@@ -9,7 +9,7 @@ from conftest import slow_rows
 from helpers.questions import captured, in_a_row, pairs_of, parted_cases, scene_of, to_matrix
 from helpers.samples import sample
 from helpers.scenes import scene_with
-from helpers.solids import model_of, moved
+from helpers.solids import moved
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
@@ -149,12 +149,3 @@ def test_launches_of_every_kind_give_the_same(device):
     row = in_a_row(device, "box", (0, 1.5, 9)).intersect(None, "distance", beyond=1.0)
     np.testing.assert_array_equal(row.gradient[:, :, :3], [[[-1, 0, 0], [1, 0, 0]]])
     assert scene.intersect(np.empty((0, 2), int), "distance").gradient.shape == (0, 2, 6)
-
-
-def test_meshes_far_from_their_origin(device):
-    """The rotation vector turns an object about its frame's origin, wherever its mesh lies."""
-    tooth = model_of(([[5.0, 0, 0], [6, 1, 2], [6, -1, 2], [7, 0, 2]], [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]))
-    scene = scene_with(device, (BOX, moved(3.0, 0, 0)), (tooth, moved(-2.0, 0, 2.5)))
-    (gradient,) = scene.intersect([(0, 1)], "distance").gradient
-    np.testing.assert_allclose(gradient[1], [0, 0, 1, 0, -5, 0], rtol=0, atol=1e-14)
-    np.testing.assert_allclose(gradient[0], [0, 0, -1, 0, 0, 0], rtol=0, atol=1e-14)

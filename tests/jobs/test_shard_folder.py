@@ -119,15 +119,13 @@ def test_a_shard_of_another_job_is_refused(tmp_path, place):
     assert (run(job, out)["damaged"], run(job, out)["kept"]) == (1, 3)
     path.write_bytes(held)
     refuse(job, out, "a shard of another job", str(path))
-
-
-@pytest.mark.parametrize("name", ["000000000000-000000000030.npz", "000000000060-000000000080.npz"])
-def test_a_shard_with_a_name_of_another_job_is_refused(tmp_path, name):
-    job, out = job_of(), tmp_path / "out"
+    path.unlink()
     run(job, out)
-    path = out / f"shard-{name}"
-    path.write_bytes(shard_at(out, 0).read_bytes())
-    refuse(job, out, "a shard of another job", str(path))
+    for name in ("000000000000-000000000030.npz", "000000000060-000000000080.npz"):  # of another job
+        path = out / f"shard-{name}"
+        path.write_bytes(shard_at(out, 0).read_bytes())
+        refuse(job, out, "a shard of another job", str(path))
+        path.unlink()
 
 
 @pytest.mark.parametrize(
@@ -180,14 +178,6 @@ def test_an_altered_manifest_is_refused(tmp_path, change):
     refuse(job, out, what, str(out / MANIFEST))
 
 
-def test_missing_rights_are_no_damage(tmp_path):
-    run(job_of(), tmp_path / "out")
-    path = shard_at(tmp_path / "out", 1)
-    path.unlink()
-    path.mkdir()
-    refuse(job_of(), tmp_path / "out", path.name, error=OSError)
-
-
 @pytest.mark.parametrize("output", ["count", "contacts"])
 def test_several_devices_of_one_process_write_the_same(device, tmp_path, output):
     job = SweepJob(*pair(), poses_of(), lods_of(100), output=output, shard=7)
@@ -222,11 +212,6 @@ def test_every_shard_is_computed_under_the_device_lock(tmp_path, monkeypatch, co
     assert locked == [True] * 5
 
 
-def test_a_job_without_poses_has_no_shards(tmp_path):
-    done = run(SweepJob(*pair(), np.empty((0, 7))), tmp_path / "out")
-    assert done["shards"] == 0 and list(read_shards(tmp_path / "out")) == []
-
-
 def test_an_interrupted_job_continues(tmp_path, monkeypatch):
     job, again = (job_of("faces", count=100, shard=9) for _ in range(2))
     out = tmp_path / "out"
@@ -247,8 +232,8 @@ def test_an_interrupted_job_continues(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="pipes of POSIX")
-def test_a_pipe_is_no_shard(tmp_path):
-    """It would be waited for."""
+def test_a_pipe_is_no_shard_and_missing_rights_are_no_damage(tmp_path):
+    """A pipe would be waited for."""
     job, out = job_of("any", count=20, shard=10), tmp_path / "out"
     run(job, out)
     path = out / "shard-000000000010-000000000020.npz"
@@ -256,18 +241,9 @@ def test_a_pipe_is_no_shard(tmp_path):
     os.mkfifo(path)
     refused(ValueError, "1 of 2 shards are missing", list, read_shards(out))
     refused(OSError, "is neither a file nor a folder", run, job, out)
-
-
-def test_files_of_other_programs_stay(tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "film.partial").write_text("half")
-    refused(ValueError, "is not empty", run, job_of("any", count=20), out)
-    (out / "film.partial").unlink()
-    run(job_of("any", count=20), out)
-    (out / "film.partial").write_text("half")
-    run(job_of("any", count=20), out)
-    assert (out / "film.partial").read_text() == "half"
+    path.unlink()
+    path.mkdir()
+    refuse(job, out, path.name, error=OSError)
 
 
 def test_a_folder_is_of_one_job(tmp_path):
@@ -298,6 +274,13 @@ def test_folders_that_are_no_jobs_are_refused(tmp_path):
     ):
         refused(ValueError, what, run, job_of(), tmp_path / out)
     refused(ValueError, r"holds no job\.json", list, read_shards(tmp_path / "full"))
+    (tmp_path / "full" / "thesis.txt").rename(tmp_path / "full" / "film.partial")
+    refused(ValueError, "is not empty", run, job_of(), tmp_path / "full")
+    job, out = SweepJob(*pair(), np.empty((0, 7))), tmp_path / "out"
+    run(job, out)
+    (out / "film.partial").write_text("half")  # files of other programs stay
+    assert run(job, out)["shards"] == 0 and list(read_shards(out)) == []
+    assert (out / "film.partial").read_text() == "half"
 
 
 @pytest.mark.parametrize(

@@ -120,15 +120,6 @@ def test_edges_are_free_until_paddings_meet(device):
     np.testing.assert_array_equal(meets(after).any(1), met)
 
 
-def test_what_is_inside_a_solid_meets_it(device):
-    car = ab.Robot(described_chain(CUBE, ("prismatic", X, HERE, 1.0)), device)
-    car.link_padding = {"link 1": 0.01}
-    scene = ab.Scene(device)
-    scene.add(ab.Model.load(trimesh.creation.box((1, 1, 1))), solid=True)
-    assert car.check([[0.0], [0.5], [0.555], [0.57]], scene).tolist() == [True, True, True, False]
-    assert car.check_edges([[2.0]], [[0.0]], scene)["time"] == pytest.approx((2 - 0.56) / 2, abs=1e-3)
-
-
 def test_paddings_go_with_links(device):
     arm, rows = padded_arm(device), random_configurations(30, seed=7)
     expected = arm.check(rows, AROUND)

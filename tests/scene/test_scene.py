@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers import refused
 from helpers.questions import in_a_row, to_matrix
-from helpers.samples import STILL, random_poses, raw_state, sample
+from helpers.samples import STILL, random_poses, sample
 from helpers.scenes import TURN, everything, pair_scene, scene_with
 from oracles.triangle import pose_matrix
 
@@ -44,20 +44,6 @@ def test_matrices_are_taken_as_they_are(device, dtype):
     for rotation, position in (placed(scene), [part[::2] for part in placed(mixed)]):
         np.testing.assert_array_equal(rotation, poses[:, :3, :3].astype(np.float64))
         np.testing.assert_array_equal(position, poses[:, :3, 3].astype(np.float64))
-
-
-def test_add_keeps_poses_and_lods(device):
-    scene = pair_scene(device)
-    scene.set_poses(random_poses(np.random.default_rng(3), 3, 5.0))
-    scene.set_lods([7, 3, 20])
-    before, states = placed(scene), [raw_state(scene, i) for i in range(3)]
-    scene.add(sample("torus"), TURN, lod=5)
-    scene.add(sample("box"))
-    assert scene.lods.tolist() == [7, 3, 20, 5, sample("box").lod_max]
-    for old, new in zip(before, placed(scene), strict=True):
-        np.testing.assert_array_equal(new[:3], old)
-    np.testing.assert_array_equal(placed(scene)[0][3], TURN[:3, :3])
-    np.testing.assert_equal([raw_state(scene, i) for i in range(3)], states)
 
 
 @pytest.mark.parametrize("matrices", [False, True])

@@ -51,15 +51,6 @@ def test_lod_requests():
         refused(ValueError, None, resolve_lod, RING, request)
 
 
-def test_trees_are_refitted_in_the_first_frame_and_where_lods_change(device):
-    def lods_at(time):
-        return np.array([RING.lod_max, 60, 40] if time < 0.25 else [50, 60, 50])
-
-    rows = ab.Frame(scene_with(device, *MODELS), make_motion(), lods_at, time_step=0.1).run(5)
-    assert [row.nodes_refitted > 0 for row in rows] == [True, False, False, True, False]
-    assert [row.states for row in rows] == [3, 3, 3, 2, 2]
-
-
 def test_stages_are_timed_apart():
     steps = [100.0, 0.5, 0.001, 0.020, 0.300, 4.0, 60.0, 50.0, 0.6, 0.002, 0.030, 0.400, 5.0, 70.0]
     ticks = iter(np.cumsum(steps))

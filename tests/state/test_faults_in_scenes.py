@@ -3,6 +3,7 @@
 Out of memory, each call raises one clear error and nothing has changed; interrupted, LODs, poses and answers are as
 before."""
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -21,6 +22,7 @@ from helpers.samples import random_poses, sample
 from helpers.scenes import everything
 
 import warp_abtree as ab
+from warp_abtree.checks import radix_sort
 from warp_abtree.checks.cpu_threads import core_count
 
 MOVES = {"one apart": [0, 3, 5, 9], "pool grows": [2, 30, 11, 60]}
@@ -254,3 +256,27 @@ def test_a_real_interruption():
             pass
         timer.join()
         np.testing.assert_array_equal(scene.intersect(output="count").count, expected)
+
+
+@pytest.mark.parametrize("failures", [0, 1, radix_sort.SORT_ATTEMPTS])
+def test_a_sort_that_fails_is_repeated_then_an_error(device, monkeypatch, failures):
+    numbers = np.random.default_rng(0).permutation(64)
+    keys = wp.array(np.tile(numbers, 2), dtype=wp.int64, device=device)
+    values = wp.array(np.tile(numbers, 2), dtype=wp.int32, device=device)
+    sort, left = wp.utils.radix_sort_pairs, [failures]
+
+    def fail(*args, **options):
+        left[0] -= 1
+        if left[0] < 0:
+            sort(*args, **options)
+        else:
+            ctypes.memmove(radix_sort._error_address(), b"no device\0", 10)
+
+    monkeypatch.setattr(wp.utils, "radix_sort_pairs", fail)
+    if failures == radix_sort.SORT_ATTEMPTS:
+        with pytest.raises(RuntimeError, match=f"64 numbers on {device} were not sorted: no device"):
+            radix_sort.radix_sort(keys, values, 64, 7)
+        return
+    radix_sort.radix_sort(keys, values, 64, 7)
+    np.testing.assert_array_equal(keys.numpy()[:64], np.arange(64))
+    np.testing.assert_array_equal(values.numpy()[:64], np.arange(64))
