@@ -122,6 +122,17 @@ def test_without_memory_nothing_matches(device, world):
         assert (rows(contacts)[2] == -1).all()
 
 
+def test_contacts_without_generations_do_not_match(world):
+    """As those of Newton 1.6, which Isaac Lab 3.0 asks for."""
+    model, state, _ = world
+    found = ab.NewtonContacts(model)
+    contacts = found.contacts()
+    del contacts.rigid_contact_match_generation
+    for _ in range(2):
+        found.collide(state, contacts)
+        assert len(rows(contacts)[0]) == 4 * COUNT and (rows(contacts)[2] == -1).all()
+
+
 def test_contents_of_others_do_not_match(device, world):
     """Another finder writes the buffer, it is cleared, or the query is launched between two calls."""
     model, state, _ = world

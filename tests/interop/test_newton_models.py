@@ -108,13 +108,14 @@ def test_worlds_have_meshes_of_their_own(device):
     np.testing.assert_allclose(np.linalg.norm(points[second == 3, :2], axis=1), 0.8, atol=0.02)
 
 
-def ring_model(device, count):
+def ring_model(device, count, others=True):
     builder = newton.ModelBuilder()
-    builder.add_ground_plane()
+    if others:
+        builder.add_ground_plane()
+        builder.add_shape_sphere(builder.add_body(xform=at(6.0, z=0.295)), radius=0.3, cfg=NEAR)
     builder.add_shape_mesh(-1, xform=at(z=0.5), mesh=FLOOR, cfg=NEAR)
     for k in range(count):
         builder.add_shape_mesh(builder.add_body(xform=at(z=1.255 + 0.505 * k)), mesh=RING, cfg=NEAR)
-    builder.add_shape_sphere(builder.add_body(xform=at(6.0, z=0.295)), radius=0.3, cfg=NEAR)
     return builder.finalize(device=device)
 
 
@@ -135,6 +136,26 @@ def test_contacts_keep_their_order_as_bodies_move(device, monkeypatch):
         again = contact_rows(contacts, *COLUMNS)
         found.collide(state, contacts)
         for one, two in zip(again, contact_rows(contacts, *COLUMNS)):
+            np.testing.assert_array_equal(one, two)
+
+
+@pytest.mark.filterwarnings("ignore:Model.request_contact_attributes")  # deprecated, but what Isaac Lab 3.0 calls
+@pytest.mark.parametrize("others", [False, True])
+def test_a_loop_as_isaac_labs(device, monkeypatch, others):
+    """It takes the pipeline's contacts, with what sensors read, or larger ones, for states that take turns."""
+    monkeypatch.setattr(newton, "CollisionPipeline", PairContacts)
+    model = ring_model(device, 2, others)
+    model.request_contact_attributes("force")
+    pipeline, states, found = ab.NewtonContacts(model), (model.state(), model.state()), []
+    contacts = pipeline.contacts()
+    assert others or contacts.force is not None  # with others their pipeline makes the contacts
+    for room in (contacts, newton.Contacts(2 * contacts.rigid_contact_max, 0, device=device)):
+        for state in states:
+            pipeline.collide(state, room)
+            found.append(contact_rows(room, *COLUMNS))
+    assert len(found[0][0]) >= 8
+    for rows in found[1:]:
+        for one, two in zip(rows, found[0], strict=True):
             np.testing.assert_array_equal(one, two)
 
 
