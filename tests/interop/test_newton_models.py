@@ -80,13 +80,14 @@ def test_worlds_have_meshes_of_their_own(device):
     np.testing.assert_allclose(np.linalg.norm(points[second == 3, :2], axis=1), 0.8, atol=0.02)
 
 
-def ring_model(device, count):
+def ring_model(device, count, others=True):
     builder = newton.ModelBuilder()
-    builder.add_ground_plane()
+    if others:
+        builder.add_ground_plane()
+        builder.add_shape_sphere(builder.add_body(xform=at(6.0, z=0.295)), radius=0.3, cfg=NEAR)
     builder.add_shape_mesh(-1, xform=at(z=0.5), mesh=FLOOR, cfg=NEAR)
     for k in range(count):
         builder.add_shape_mesh(builder.add_body(xform=at(z=1.255 + 0.505 * k)), mesh=RING, cfg=NEAR)
-    builder.add_shape_sphere(builder.add_body(xform=at(6.0, z=0.295)), radius=0.3, cfg=NEAR)
     return builder.finalize(device=device)
 
 
@@ -108,6 +109,53 @@ def test_contacts_keep_their_order_as_bodies_move(device, monkeypatch):
         found.collide(state, contacts)
         for one, two in zip(again, contact_rows(contacts, *COLUMNS)):
             np.testing.assert_array_equal(one, two)
+
+
+@pytest.mark.filterwarnings("ignore:Model.request_contact_attributes")  # deprecated, but what Isaac Lab 3.0 calls
+@pytest.mark.parametrize("others", [False, True])
+def test_a_loop_as_isaac_labs(device, monkeypatch, others):
+    """It takes the pipeline's contacts, with what sensors read, or larger ones, for states that take turns."""
+    monkeypatch.setattr(newton, "CollisionPipeline", PairContacts)
+    model = ring_model(device, 2, others)
+    model.request_contact_attributes("force")
+    pipeline, states, found = ab.NewtonContacts(model), (model.state(), model.state()), []
+    contacts = pipeline.contacts()
+    assert others or contacts.force is not None  # with others their pipeline makes the contacts
+    for room in (contacts, newton.Contacts(2 * contacts.rigid_contact_max, 0, device=device)):
+        for state in states:
+            pipeline.collide(state, room)
+            found.append(contact_rows(room, *COLUMNS))
+    assert len(found[0][0]) >= 8
+    for rows in found[1:]:
+        for one, two in zip(rows, found[0], strict=True):
+            np.testing.assert_array_equal(one, two)
+
+
+@pytest.mark.slow
+def test_collide_in_a_capture_launches_only(device):
+    """A graph of collide and a solver's step has the bits of doing so step by step."""
+    model = ring_model(device, 2)
+    ends = []
+    for captured in (False, True):
+        found, state, after = ab.NewtonContacts(model), model.state(), model.state()
+        solver, control, contacts = newton.solvers.SolverXPBD(model), model.control(), found.contacts()
+
+        def step(found=found, solver=solver, state=state, after=after, control=control, contacts=contacts):
+            found.collide(state, contacts)
+            state.clear_forces()
+            solver.step(state, after, control, contacts, 1 / 240)
+            state.assign(after)
+
+        step()
+        if captured:
+            with wp.ScopedCapture(device) as capture:
+                step()
+        for _ in range(20):
+            wp.capture_launch(capture.graph) if captured else step()
+        found.check(contacts)
+        ends.append(state.body_q.numpy().copy())
+    assert np.abs(ends[0][:, 2] - model.body_q.numpy()[:, 2]).max() > 1e-4
+    np.testing.assert_array_equal(*ends)
 
 
 @pytest.fixture(scope="module")
@@ -253,6 +301,17 @@ def test_without_memory_nothing_matches(device, world):
     for _ in range(2):
         found.collide(state, contacts)
         assert (rows(contacts)[2] == -1).all()
+
+
+def test_contacts_without_generations_do_not_match(world):
+    """As those of Newton 1.6, which Isaac Lab 3.0 asks for."""
+    model, state, _ = world
+    found = ab.NewtonContacts(model)
+    contacts = found.contacts()
+    del contacts.rigid_contact_match_generation
+    for _ in range(2):
+        found.collide(state, contacts)
+        assert len(rows(contacts)[0]) > 0 and (rows(contacts)[2] == -1).all()
 
 
 def test_contents_of_others_do_not_match(device, world):

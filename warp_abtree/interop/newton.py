@@ -256,7 +256,10 @@ class NewtonContacts(DeviceMemory):
             room = self.query.point_max * len(self.query.pairs) + POINTS_MAX * others
         if not self._has_others:
             matching = self.query.memory is not None
-            return self.newton.Contacts(room, 0, device=self.device, contact_matching=matching)
+            asked = self.model.get_requested_contact_attributes()
+            return self.newton.Contacts(
+                room, 0, device=self.device, requested_attributes=asked, contact_matching=matching
+            )
         self._make_others(room)
         return self.others.contacts()
 
@@ -326,7 +329,9 @@ class NewtonContacts(DeviceMemory):
         wp.launch(kernels.pose_object_kernel, len(self.shapes), inputs, device=self.device)
 
     def _write(self, state, contacts):
-        index = None if self.query.memory is None else contacts.rigid_contact_match_index
+        # Contacts of Newton 1.6 have match indices without generations: all of them stay new ones.
+        matches = self.query.memory is not None and hasattr(contacts, "rigid_contact_match_generation")
+        index = contacts.rigid_contact_match_index if matches else None
         if index is not None:
             wp.copy(self._matching.generation, contacts.contact_generation)
         if self.others is None:
