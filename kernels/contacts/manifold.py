@@ -7,7 +7,7 @@ from warp_abtree.kernels.base.arrays import ObjectPool, Trees
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.contacts.column import COLUMN_CORNERS, NO_DEPTH, FacePair, load_pair
 from warp_abtree.kernels.contacts.contact import Contacts
-from warp_abtree.kernels.contacts.slots import Slots, WitnessRows
+from warp_abtree.kernels.contacts.slots import Slots, WitnessRows, gap_of
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 
 wp.set_module_options(native.options("contacts/candidates.cuh", "contacts/crossing_list.h"))
@@ -86,15 +86,6 @@ def find_crossing(
     witnesses: Witnesses,
 ) -> bool:
     """Write the normal and the candidates of witness w, as for `offer_crossing`; return whether they have a depth."""
-
-
-@wp.func
-def gap_of(gap: wp.array(dtype=wp.float64), p: wp.int32):
-    """Return the gap of a pair, 0 where there is none."""
-    shell = wp.float64(0.0)
-    if gap.shape[0] > 0:
-        shell = gap[p]
-    return shell
 
 
 @wp.func

@@ -28,7 +28,7 @@ from warp_abtree.kernels.base.nodes import load_entry, store_entry
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.contacts.column import COLUMN_CORNERS, NO_DEPTH
 from warp_abtree.kernels.contacts.manifold import Manifolds, Witnesses
-from warp_abtree.kernels.contacts.slots import WitnessRows
+from warp_abtree.kernels.contacts.slots import WitnessRows, gap_of
 
 TWIST_COUNT, RANDOM_TWISTS = native.constant("TWIST_COUNT"), native.constant("RANDOM_TWISTS")
 MODULE_OPTIONS = native.options("contacts/twists.cuh") | {"block_dim": TWIST_COUNT}
@@ -262,9 +262,7 @@ def point_chooser(most: int):
             if group_lane() == 0:
                 manifolds_out.count[p] = 0
             return
-        zero, shell = wp.float64(0.0), wp.float64(0.0)
-        if gap.shape[0] > 0:
-            shell = gap[p]
+        zero, shell = wp.float64(0.0), gap_of(gap, p)
         a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
         pose = ObjectPose()
         pose.rotation = objects.rotation[a]

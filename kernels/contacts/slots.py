@@ -77,6 +77,15 @@ def offer_faces(
 
 
 @wp.func
+def gap_of(gap: wp.array(dtype=wp.float64), p: wp.int32):
+    """Return the gap of a pair, 0 where there is none."""
+    shell = wp.float64(0.0)
+    if gap.shape[0] > 0:
+        shell = gap[p]
+    return shell
+
+
+@wp.func
 def tree_size(trees: Trees, state: wp.int32):
     """Return half of the diagonal of the root box of a tree state."""
     root = load_node(trees.states, trees.states.node_start[state] + 1)
@@ -113,9 +122,7 @@ def start_slots_kernel(
     if i == 0:
         hits_out.witness_total[0] = 0
     if i == p * SLOT_ROOM and p < batch.count[0] and p < batch.pairs.shape[0]:
-        shell = wp.float64(0.0)
-        if gap.shape[0] > 0:
-            shell = gap[p]
+        shell = gap_of(gap, p)
         size = smaller_size(trees, batch.pairs[p][0], batch.pairs[p][1])
         weight = WEIGHT_LEAST
         if shell > WEIGHT_LEAST * size:
