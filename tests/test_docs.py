@@ -188,11 +188,6 @@ def test_hints_name_packages_that_there_are():
     assert not wrong, "the project is on no package index"
 
 
-def test_benchmarks_exist():
-    named = {name for page in PAGES for name in re.findall(r"python -m bench (\w+)", page.read_text(encoding="utf-8"))}
-    assert len(named) > 10 and named <= {*bench.CASES, *bench.STUDIES}
-
-
 SAMPLES = sorted((ROOT / "scenes").glob("[0-9]*.py"))
 
 
@@ -212,10 +207,12 @@ def test_samples_run_and_stand_in_their_pages(path):
     assert shown.getvalue()
 
 
-def test_samples_are_numbered_in_the_order_of_the_site():
+def test_samples_are_numbered_as_in_the_site_and_benchmarks_exist():
     names = [re.search(r"docs/(\w+\.md)", path.read_text(encoding="utf-8"))[1] for path in SAMPLES]
     site = re.findall(r"- (howto_\w+\.md)", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
     assert len(names) >= 5 and [name for name in site if name in names] == names
+    named = {name for page in PAGES for name in re.findall(r"python -m bench (\w+)", page.read_text(encoding="utf-8"))}
+    assert len(named) > 10 and named <= {*bench.CASES, *bench.STUDIES}
 
 
 def test_readme_fits_a_screen_or_two_and_has_a_line_for_the_run_and_one_for_the_tests():
@@ -276,16 +273,13 @@ def test_budget_example(device):
 
 
 @pytest.mark.slow
-def test_several_gpus_example(device):
+def test_several_gpus_example(device, monkeypatch):
     words = "--worlds 5 --frames 40 --devices".split()
     counts, shown = run_example("several_gpus", *words, f"{device},{device}")
     assert f"one scene on {device} counts the same" in shown
     assert counts.shape == (5,) and counts.all() and len(set(counts)) > 1
     for devices in (device, ",".join([device] * 7), "cpu"):
         assert np.array_equal(run_example("several_gpus", *words, devices)[0], counts)
-
-
-def test_several_gpus_example_tells_a_wrong_count(device, monkeypatch):
     monkeypatch.setattr(wp, "capture_launch", lambda graph: None)
     with pytest.raises(SystemExit, match=f"one scene on {device} counts otherwise"):
         run_example("several_gpus", "--devices", device, "--worlds", 3)

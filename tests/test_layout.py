@@ -104,9 +104,6 @@ def test_folders_hold_few_files():
     counts = {shown(folder): len([p for p in (*FILES, *NATIVE) if p.parent == folder]) for folder in folders}
     full = {folder: count for folder, count in counts.items() if count > rules.FOLDER_FILES + 1}
     assert full == {}, "__init__.py apart"
-
-
-def test_files_of_tests_have_names_of_their_own():
     names = [path.name for path in TESTS if path.name.startswith("test_")]
     assert sorted(names) == sorted(set(names)), "pytest imports them by their names"
 
@@ -228,6 +225,16 @@ RULES = {
         ["def f():\n    pass", "class f:\n    pass", "f = 1", "e, f = 1, 2", "e, (f, g) = x", "f: int = 1"],
         ["from a import f\n_f = 1\nMODULE_OPTIONS = {}\ndef h():\n    f = 1", "MODULE_OPTIONS = f.x = _f = 1"],
     ),
+    "cycles": (
+        rules.find_cycle,
+        [{"a": {"b"}, "b": {"c"}, "c": {"a"}}, {"a": {"b", "c"}, "b": {"c"}, "c": {"b"}}],
+        [{"a": {"b", "c"}, "b": {"c"}, "c": {"numpy"}}],
+    ),
+    "imports inside functions": (
+        lambda source: "warp_abtree.model.tree" in rules.import_edges(ROOT / "warp_abtree" / "names.py", parse(source)),
+        ["def f():\n    from warp_abtree.model import tree"],
+        ["def f():\n    from numpy import tree"],
+    ),
     "groups of kernels": (
         lambda source: rules.group_faults(parse(source), "search"),
         [
@@ -245,10 +252,3 @@ def test_a_rule_catches_its_breaks(rule):
     find_faults, broken, fine = RULES[rule]
     assert [source for source in broken if not find_faults(source)] == []
     assert [source for source in fine if find_faults(source)] == []
-
-
-def test_rule_of_cycles_catches():
-    assert rules.find_cycle({"a": {"b"}, "b": {"c"}, "c": {"a"}}) == ["a", "b", "c"]
-    assert not rules.find_cycle({"a": {"b", "c"}, "b": {"c"}, "c": {"numpy"}})
-    inside = parse("def f():\n    from warp_abtree.model import tree")
-    assert "warp_abtree.model.tree" in rules.import_edges(ROOT / "warp_abtree" / "model" / "inside.py", inside)

@@ -44,7 +44,7 @@ def test_run_for_programs(scene):
     assert found["lod_min"] == min(row["lod_min"] for row in rows)
 
 
-def test_run_under_a_budget(scene):
+def test_run_under_a_budget_which_may_be_impossible(scene):
     shown, errors = scene("--frames 8 --budget 50ms")
     for line in ("controller +predictive", "budget ms +50", "select_ms +[\\d.]+", "budget +frames 4, .*", "objects +4"):
         assert re.search(f"^{line}", shown, re.M), line
@@ -54,10 +54,7 @@ def test_run_under_a_budget(scene):
     assert found["stages"]["select_ms"]["total"] > 0 and set(found["stages"]) == {*STAGE_LABELS, "total_ms"}
     parts = sum(found["stages"][name]["total"] for name in STAGE_LABELS)
     assert found["stages"]["total_ms"]["total"] == pytest.approx(parts)
-
-
-def test_an_impossible_budget_is_called_so(scene):
-    """One that no level of detail can hold; not one that is easy."""
+    # One that no level of detail can hold; not one that is easy.
     shown, errors = scene("--frames 8 --budget 0.001ms")
     (said,) = errors
     assert re.fullmatch(r"warp-abtree: a budget of 0.001 ms is impossible here: .* frames take [\d.]+ ms", said)
@@ -105,24 +102,6 @@ def test_picture_of_rigid_bodies(scene):
     assert first.shape != last.shape or not np.array_equal(first, last)
 
 
-@pytest.mark.slow
-def test_picture(scene):
-    pytest.importorskip("pyvista")
-    shown, _ = scene("--frames 2 --picture out.png")
-    assert re.search("^written +out.png$", shown, re.M)
-    image = matplotlib.image.imread("out.png")[:, :, :3]
-    assert image.shape[1] > 600
-    # Both panels show plain and intersecting faces of both models.
-    for half in np.array_split(image[100:-50], 2, axis=1):
-        red, green, blue = half.reshape(-1, 3).T
-        assert np.mean((red > 0.98) & (green > 0.98) & (blue > 0.98)) > 0.1, "background"
-        assert np.mean((blue > 1.4 * red) & (blue > 1.2 * green)) > 0.02, "ring"
-        assert np.mean((red > green) & (green > blue) & (red < 1.4 * blue) & (red < 0.95)) > 0.02, "ball"
-        assert np.mean((green > 1.8 * red) & (green > 1.8 * blue)) > 0.002, "intersecting faces of the ball"
-        assert np.mean((red > 2 * blue) & (green > 2 * blue)) > 0.002, "intersecting faces of the ring"
-    assert sorted(path.name for path in Path().glob("out*")) == ["out.png"]
-
-
 # picture.
 
 
@@ -150,16 +129,6 @@ def test_picture_of_meshes(picture):
     shown = picture("ball.obj ball.obj --pose 9 0 0 0 0 0 1 --lod 0.2 --json -o apart.png")
     assert json.loads(shown) == {"picture": "apart.png", "objects": 2, "frame": 0}
     assert not count("apart.png", COLOURS[0][1])
-
-
-@pytest.mark.slow
-def test_picture_of_a_frame(picture):
-    picture("scene.toml --frame 0 --out first.png")
-    picture("scene.toml --frame 3 --out last.png")
-    first, last = (matplotlib.image.imread(f"{name}.png") for name in ("first", "last"))
-    assert first.shape != last.shape or not np.array_equal(first, last)
-    picture("scene.toml --world 2 --eye 0 0 1 --out world.png")
-    assert count("world.png", COLOURS[0][0]) < count("first.png", COLOURS[0][0])
 
 
 @pytest.mark.slow

@@ -118,11 +118,6 @@ def test_the_server_refuses_websockets_and_files(server):
         assert is_refused(SimpleNamespace(headers=Headers([*headers, again])), "127.0.0.1"), "said twice"
 
 
-def test_a_server_that_does_not_ask_is_not_used():
-    with pytest.raises(ValueError, match="cannot be kept from foreign pages"), refuse_foreign("127.0.0.1"):
-        pass
-
-
 @pytest.mark.slow
 def test_a_page_stands_until_it_is_told_to_play(page):
     assert page.snapshots == 1 and page.snapshot.number == 0 and "| state | paused |" in page._state.content
@@ -302,14 +297,13 @@ def test_a_scene_made_in_python_is_shown(device, capsys):
     assert np.allclose(scene.batch().objects.pool.position.numpy(), poses[:, :3])
 
 
-def test_what_view_refuses(device):
+def test_what_cannot_be_shown_or_served(device, tmp_path, capsys):
     refused(TypeError, "not a Scene", view, make_models()[0])
     refused(ValueError, "no object", view, ab.Scene(device))
     for port in (-1, 65_536):
         refused(ValueError, "port", view, ab.Scene(device), port=port)
-
-
-def test_a_port_that_is_taken(tmp_path, capsys):
+    with pytest.raises(ValueError, match="cannot be kept from foreign pages"), refuse_foreign("127.0.0.1"):
+        pass
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()

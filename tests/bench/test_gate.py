@@ -81,9 +81,7 @@ def test_only_what_exceeds_its_own_noise_is_slower():
     assert not nightly.find_slower([line(1.0), line(1.4)], {"a": [1.6]}), "the days before do"
     assert not nightly.find_slower(steady[:1], {"a": [9.0]}), "one day tells no noise"
     assert not nightly.find_slower(steady, {"a": [0.1]})
-
-
-def test_lines_of_another_device_case_or_size_are_not_compared():
+    # Lines of another device, case or size are not compared.
     lines = [line(1.0, device="y"), line(2.0, case="host"), line(3.0, quick=False), *(line(n) for n in range(9))]
     kept = nightly.same_kind(lines, line(0.0))
     assert [found["series"]["a"] for found in kept] == [[n] for n in range(9)][-nightly.BEFORE :]

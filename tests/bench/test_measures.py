@@ -18,16 +18,12 @@ from warp_abtree.query.result import contact_dtypes
 pytestmark = pytest.mark.slow
 
 
-def test_slope_and_crossover():
+def test_fits():
     assert timing.fit_slope([1, 10, 100], [2.0, 20.0, 200.0]) == 1 and timing.fit_slope([3], [1.0]) is None
     x, excess = np.array([1, 10, 80, 125, 1000]), np.log(np.array([1, 10, 80, 125, 1000]) / 100)
     found = [timing.crossover(x[some], excess[some], 0.0) for some in (slice(5), slice(3), slice(3, 5))]
     assert found == [pytest.approx(100), None, 0.0]
-
-
-def test_fit_of_figure_6():
-    """Times that are 3 ns a node of equation (1) give that back, and the crossover with a flat full refit."""
-    # One face of n: its path, log2 n + 1 nodes; all of a full tree: 2 n - 1.
+    # Times that are 3 ns a node of equation (1) give that back, and the crossover with a flat full refit.
     assert bound_nodes(1, 1024) == 11 and bound_nodes(1024, 1024) == 2047 and bound_nodes(0, 5) == 0
     rows = []
     for fraction in np.geomspace(0.001, 1, 40):
@@ -161,10 +157,7 @@ def test_penetration_that_points_allow():
     for points, way in ((middle, goes), (penetration.Contacts(*(part[:0] for part in square)), 2 * gap + 0 * goes)):
         expected = np.maximum(0, -(square.separation + rates * way[:, None]).min(1))
         np.testing.assert_allclose(penetration.penetration_allowed(square, points, gap), expected, atol=1e-15)
-
-
-def test_penetration_counts_from_the_start():
-    """What is inside when a motion begins is not counted, and a point that is inside blocks at once."""
+    # What is inside when a motion begins is not counted, and a point that is inside blocks at once.
     sunk = corners_at([-0.01, 0.02, 0.02, 0.02])
     deepest = penetration.Contacts(*(part[:1] for part in sunk))
     allowed = penetration.penetration_allowed(sunk, deepest, 0.1)

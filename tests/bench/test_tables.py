@@ -90,15 +90,12 @@ def test_tables_of_pages_change_with_their_data(tmp_path):
     assert {table["part"] for table in laid_out if "title" in table} == set(data["parts"])
 
 
-def test_a_short_table_has_some_rows_and_columns():
+def test_tables_that_are_short_or_not_there():
     study = {"parts": {"one": {"rows": [{"a": n, "b": n + 0.5} for n in range(3)]}}}
     layout = {"part": "one", "columns": [["a", "A"], ["b", "B", ".2f"]]}
     assert tables.markdown_table(layout, study).count("\n") == 4
     short = {"where": {"a": [1, 2]}, "columns": ["b"]}
     assert tables.markdown_table(layout, study, short) == "| B |\n| --: |\n| 1.50 |\n| 2.50 |"
-
-
-def test_a_place_for_a_table_that_there_is_not():
     data = json.loads((DATA / "performance.json").read_text(encoding="utf-8"))
     other = "<!-- table other gone -->\n<!-- end -->"
     assert tables.fill_page(other, "performance", data) == other

@@ -353,8 +353,5 @@ def test_no_name_is_the_frame_of_all(device):
         assert [out.graph[name][0][:3, 3].tolist() for name in names] == [[1, 0, 0], [2, 0, 0], [5, 2, 0]]
         back = ab.scene_from_trimesh(out, device)
         assert back.poses[:, :3].tolist() == [[1, 0, 0], [2, 0, 0], [5, 2, 0]]
-
-
-def test_one_world_out():
     scene = scene_with("cpu", *[(ab.Model.load(BOX), np.eye(4), {"world": world}) for world in (-1, 0, 1, 1)])
     assert sorted(ab.to_trimesh(scene, world=1).graph.nodes_geometry) == ["trimesh 0", "trimesh 2", "trimesh 3"]

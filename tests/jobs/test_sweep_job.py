@@ -152,6 +152,8 @@ def test_bad_input_is_named(tmp_path, monkeypatch):
     ):
         refused(ValueError, what, SweepJob, *pair(), poses, **options)
     refused(TypeError, "not a Model", SweepJob, "torus", sample("torus"), poses_of())
+    for workers in (0, -1, 1.5):
+        refused(ValueError, f"^workers {workers} is ", RayPool, workers=workers)
 
 
 @pytest.fixture
@@ -270,8 +272,3 @@ def test_a_shard_that_cannot_be_computed_is_given_up(tmp_path, pool, how, error,
         pool.ray.cloudpickle.register_pickle_by_value(sys.modules[module])
     refused(error, what, run_shards, FailingJob(count=40, shard=10, output=how), tmp_path / "out", pool=pool)
     assert not (tmp_path / "out" / "shard-000000000020-000000000030.npz").exists()
-
-
-@pytest.mark.parametrize("workers", [0, -1, 1.5])
-def test_workers_are_counted_from_one(workers):
-    refused(ValueError, f"^workers {workers} is ", RayPool, workers=workers)
