@@ -70,7 +70,10 @@ def test_every_way_of_reading_is_the_same(device, output, given):
         expected = query.run()
         assert expected.any.any()
         check_same(query.result(device=True), expected)
-        check_same(query.run(device=True), expected, repeated(output))
+        kept = query.run(device=True)
+        check_same(kept, expected, repeated(output))
+        assert kept.any.device == kept.pairs.device == wp.get_device(device) and kept.any.dtype == wp.bool
+        assert kept.pairs.dtype == wp.vec2i and kept.node_tests.dtype == wp.int64
     with testing.regime(packs_results=True):
         packed = make_query(scene, output, **options)
         for found in (packed.run(), packed.result()):
@@ -80,18 +83,6 @@ def test_every_way_of_reading_is_the_same(device, output, given):
             for name in NAMES:
                 wanted = getattr(expected, name)
                 assert wanted is None or getattr(found, name).dtype == wanted.dtype
-
-
-@pytest.mark.parametrize("output", OUTPUTS)
-def test_a_scene_answers_on_its_device(device, output):
-    scene, options = add_objects(device), AS_FLOAT32 if output.endswith("32") else {}
-    output = output.split()[0]
-    expected = scene.intersect(MORE_PAIRS, output, **options)
-    kept = scene.intersect(MORE_PAIRS, output, device=True, **options)
-    kept.check()
-    check_same(kept, expected, repeated(output))
-    assert kept.any.device == kept.pairs.device == wp.get_device(device) and kept.any.dtype == wp.bool
-    assert kept.pairs.dtype == wp.vec2i and kept.node_tests.dtype == wp.int64
 
 
 @pytest.mark.parametrize("keeps", [False, True], ids=["host", "device"])
@@ -327,15 +318,3 @@ def test_any_number_of_threads(with_slabs):
         result.check()
         found.append([describe(result), *(getattr(result, name).tolist() for name in COUNTERS)])
         assert found[-1] == found[0]
-
-
-def test_a_capture_records_all_threads():
-    query = ab.Query(make_scene("cpu"), "faces", pairs=PAIRS)
-    with testing.regime(cpu_threads=4):
-        expected = query.run().faces
-        with wp.ScopedCapture("cpu") as capture:
-            query.launch()
-    query.hits.total.fill_(-1)
-    query.hits.face.fill_(0)
-    wp.capture_launch(capture.graph)
-    np.testing.assert_array_equal(query.result().faces, expected)
