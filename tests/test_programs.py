@@ -1,6 +1,7 @@
-"""Programs of scenes/programs: each runs, small, writes its picture, and finds what is true."""
+"""Programs of scenes/programs, and pictures of the pages: each is made, small, and shows what is true."""
 
 import importlib.util
+import re
 import runpy
 from pathlib import Path
 
@@ -71,3 +72,40 @@ def test_worlds_of_newton(run):
     pytest.importorskip("newton")
     rings, around = run("newton_worlds", 4, 0.5)
     assert rings.shape == (4, 7) and (rings[:, 2] < 1.6).all() and (rings[:, 2] > 0.2).all() and len(around) == 4
+
+
+@pytest.mark.slow
+def test_pictures_of_the_pages_say_what_the_library_finds(tmp_path):
+    """All that pages name, and no others; what draws is tested elsewhere, here it is what it is given."""
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("pxr")
+    spec = importlib.util.spec_from_file_location("figures", DOCS / "figures.py")
+    figures = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(figures)
+    titles = {}
+
+    def draw(panels, path, title, *_):
+        titles[path.name] = [title, *(panel.title for panel in panels)]
+        path.touch()
+
+    def words(folder):
+        return re.findall(r"<text[^>]*>([^<]*)</text>", (folder / "concept_tree.svg").read_text(encoding="utf-8"))
+
+    figures.FOLDER, figures.draw = tmp_path, draw
+    figures.main()
+    pages = "".join(path.read_text(encoding="utf-8") for path in DOCS.glob("*.md"))
+    named = re.findall(r"\(((?:concept|sample)_[\w.]+)\)", pages)
+    assert sorted(named) == sorted(path.name for path in tmp_path.iterdir()) and len(named) >= 8
+    kept = [path.name for path in DOCS.iterdir() if path.name.startswith(("concept_", "sample_"))]
+    assert sorted(named) == sorted(kept)
+    assert words(tmp_path) == words(DOCS) and len(words(DOCS)) > 5
+    title, *levels = titles["concept_traversal.png"]
+    pairs = [int(re.search(r": ([\d,]+) of", level)[1].replace(",", "")) for level in levels]
+    assert int(re.search(r"to (\d+) intersecting", title)[1]) > 50 and pairs == sorted(pairs)
+    _, *lods = titles["concept_lods.png"]
+    assert "the original" in lods[0] and [("error at most" in lod) for lod in lods] == [False, True, True, True]
+    free, also, found = map(int, re.findall(r"\d+", titles["sample_which_pairs.png"][0].split(":")[1]))
+    assert free == also == 0 and found > 50
+    lods = titles["sample_which_lod.png"]
+    assert len(lods) == 5 and all("face pairs" in lod for lod in lods[1:])
+    assert "-0." in titles["sample_how_far.png"][0], "one ball is inside"

@@ -1,7 +1,8 @@
-"""Newton's models in `NewtonContacts`: pairs, particles, worlds, order and match indices; nuts on bolts."""
+"""Newton's models in `NewtonContacts`: pairs, particles, worlds, order, match indices; nuts on bolts; mujoco_warp."""
 
 import importlib.util
-import pathlib
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from helpers.bodies import PairContacts, at, collided, contact_rows, newton_mesh
 import warp_abtree as ab
 
 newton = pytest.importorskip("newton")
+
+SCENES = Path(__file__).resolve().parents[2] / "scenes" / "interop"
 
 CUBE, FLOOR = newton_mesh(trimesh.creation.box((1, 1, 1))), newton_mesh(trimesh.creation.box((8, 8, 1)))
 RING = newton_mesh(trimesh.creation.torus(0.8, 0.25, 24, 12))
@@ -160,8 +163,7 @@ def test_collide_in_a_capture_launches_only(device):
 
 @pytest.fixture(scope="module")
 def scene():
-    path = pathlib.Path(__file__).parents[2] / "scenes/interop/newton_nut_and_bolt.py"
-    spec = importlib.util.spec_from_file_location("newton_nut_and_bolt", path)
+    spec = importlib.util.spec_from_file_location("newton_nut_and_bolt", SCENES / "newton_nut_and_bolt.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -357,3 +359,17 @@ def test_room_that_grows_keeps_matches(device, world):
     assert len(found.query.pairs) > room
     now = rows(contacts)
     np.testing.assert_array_equal(check_matches(now, before), now[0].max(1) <= 2)
+
+
+@pytest.mark.slow
+def test_rings_fall_over_a_peg_on_which_hulls_stay_in_mujoco_warp(device, capsys):
+    mujoco = pytest.importorskip("mujoco")
+    pytest.importorskip("mujoco_warp")
+    space = runpy.run_path(str(SCENES / "mujoco_warp_contacts.py"))
+    heights = space["main"](device, worlds=2, seconds=1.5)
+    assert np.abs(heights - 0.08).max() < 2e-3, "at rest, the minor radius above the floor"
+    assert " 1.0 s " in capsys.readouterr().out
+    host = space["build"]()
+    data = mujoco.MjData(host)
+    mujoco.mj_step(host, data, nstep=round(1.5 / host.opt.timestep))
+    assert data.qpos[2] > 0.85, "MuJoCo's own, by convex hulls"

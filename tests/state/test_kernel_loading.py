@@ -42,11 +42,16 @@ def loads_of(monkeypatch, cores):
 
 
 def test_each_kernel_is_loaded_once_beside_other_work(device, monkeypatch):
-    loaded, device, kernels = loads_of(monkeypatch, 4), wp.get_device(device), make_kernels(1)
+    """It is told of by the thread that asked, as kernels come; of what is loaded already nothing."""
+    loaded, device, kernels, told = loads_of(monkeypatch, 4), wp.get_device(device), make_kernels(1), []
+    monkeypatch.setattr(kernel_loading, "_told", [])
+    kernel_loading.tell_loading(lambda *counts: told.append((*counts, threading.get_ident())))
     for _ in range(2):
         with kernel_loading.loading(device, [*kernels, kernels[0]]):
             pass
         assert sorted(map(id, loaded)) == sorted(id(kernel.module) for kernel, _ in kernels)
+    counts = [done for done, total, thread in told if (total, thread) == (4, threading.get_ident())]
+    assert len(counts) == len(told) > 1 and counts == sorted(counts) and (counts[0], counts[-1]) == (0, 4)
     out = wp.zeros(1, dtype=wp.int32, device=device)
     for i, (kernel, block_dim) in enumerate(kernels):
         wp.launch(kernel, 1, [out], device=device, block_dim=block_dim)
@@ -56,21 +61,6 @@ def test_each_kernel_is_loaded_once_beside_other_work(device, monkeypatch):
     with kernel_loading.loading(wp.get_device(device), make_kernels(2)):
         pass
     assert not loaded
-
-
-def test_loading_is_told_of(device, monkeypatch):
-    """By the thread that asked, as kernels come; all are told at the end, of what is loaded already nothing."""
-    told, kernels = [], make_kernels(7)
-    loads_of(monkeypatch, 2)
-    kernel_loading.tell_loading(lambda *counts: told.append((*counts, threading.get_ident())))
-    try:
-        for _ in range(2):
-            with kernel_loading.loading(wp.get_device(device), kernels):
-                pass
-    finally:
-        kernel_loading.tell_loading(None)
-    counts = [done for done, total, thread in told if (total, thread) == (4, threading.get_ident())]
-    assert len(counts) == len(told) > 2 and counts == sorted(counts) and (counts[0], counts[-1]) == (0, 4)
 
 
 def test_an_error_ends_it_and_is_said_again(device, monkeypatch):
