@@ -16,6 +16,7 @@ import warp as wp
 from conftest import slow
 from helpers import refused
 
+import warp_abtree as ab
 from bench import __main__ as bench
 from warp_abtree.app import load_scene
 from warp_abtree.app.cli import main as cli
@@ -260,6 +261,20 @@ def test_worlds_example(device, monkeypatch):
     scene.set_poses(poses.cpu().numpy())
     expected = scene.intersect(pairs).any
     assert np.array_equal(hit.cpu().numpy(), expected) and 0 < expected.sum() < len(pairs)
+
+
+@pytest.mark.slow
+def test_planner_example(tmp_path):
+    for name in ("ompl", "yourdfpy"):
+        pytest.importorskip(name)
+    arm = runpy.run_path(str(ROOT / "scenes" / "programs" / "arm_in_a_shelf.py"))
+    with contextlib.chdir(tmp_path):
+        robot = arm["load_arm"]("cpu")
+        trimesh.creation.annulus(0.3, 0.5, 0.05).apply_translation((0, 0, 0.7)).export("around.glb")
+        way, shown = run_example("interop/ompl_planner", "arm.urdf", "around.glb", "--mounted", "base")
+        scene = ab.scene_from_file("around.glb", device="cpu")
+    assert f"{len(way)} configurations" in shown and not robot.check(way, scene).any()
+    assert robot.check_edges(way[:-1], way[1:], scene)["clear"].all()
 
 
 @pytest.mark.slow
