@@ -1,7 +1,6 @@
-"""Newton's models in `NewtonContacts`: pairs, particles, worlds, order, match indices; nuts on bolts; mujoco_warp."""
+"""Newton's models in `NewtonContacts`: pairs, particles, worlds, order, match indices; nuts on bolts."""
 
 import importlib.util
-import runpy
 from pathlib import Path
 
 import numpy as np
@@ -359,17 +358,3 @@ def test_room_that_grows_keeps_matches(device, world):
     assert len(found.query.pairs) > room
     now = rows(contacts)
     np.testing.assert_array_equal(check_matches(now, before), now[0].max(1) <= 2)
-
-
-@pytest.mark.slow
-def test_rings_fall_over_a_peg_on_which_hulls_stay_in_mujoco_warp(device, capsys):
-    mujoco = pytest.importorskip("mujoco")
-    pytest.importorskip("mujoco_warp")
-    space = runpy.run_path(str(SCENES / "mujoco_warp_contacts.py"))
-    heights = space["main"](device, worlds=2, seconds=1.5)
-    assert np.abs(heights - 0.08).max() < 2e-3, "at rest, the minor radius above the floor"
-    assert " 1.0 s " in capsys.readouterr().out
-    host = space["build"]()
-    data = mujoco.MjData(host)
-    mujoco.mj_step(host, data, nstep=round(1.5 / host.opt.timestep))
-    assert data.qpos[2] > 0.85, "MuJoCo's own, by convex hulls"
