@@ -173,3 +173,21 @@ def test_points_of_what_merely_touches_push_upwards(device, name):
         if len(up) == 0 or up.min() < 0.999 or abs(points["depth"].max() + height) > 1e-9:
             wrong.append((height, whole, turn, up, points["depth"]))
     assert not wrong
+
+
+@pytest.mark.parametrize("splits", [0, 1])
+@pytest.mark.parametrize("height", [0, 1e-9, 1e-6, 1e-4, 1e-3])
+def test_what_overhangs_an_edge_is_held_by_all_corners(device, height, splits):
+    """Of what two parallel rectangles share also the corners at which their edges cross, touching and apart."""
+    rng, table, plank, wrong = np.random.default_rng(0), box(1, 1, 0.5, splits=splits), box(1.4, 0.3, 0.2), []
+    for lower, upper in ((table, plank), (plank, table), (table, table)):
+        low, high = (np.ptp(model.mesh_at(model.lod_max)[0], axis=0) / 2 for model in (lower, upper))
+        for way in rng.uniform(-0.45, 0.45, (20, 2)):
+            poses = STILL, (*way, low[2] + high[2] + height, 0, 0, 0, 1)
+            found = ask_points(device, (lower, poses[0]), (upper, poses[1]), gap=0.01)[1].points["point"]
+            ends = np.stack([np.maximum(-low[:2], way - high[:2]), np.minimum(low[:2], way + high[:2])])
+            corners = np.array(list(itertools.product(*ends.T)))
+            away = np.linalg.norm(found[:, None, :2] - corners, axis=2).min(0)
+            if away.max() > 1e-6:
+                wrong.append((way, corners, found))
+    assert not wrong

@@ -8,6 +8,10 @@
 constexpr float LOOKS_AT = -0.5f;
 // Farther than any point.
 constexpr float FAR_AWAY = 0x1p60f;
+// Of the smaller object's size: of parallel faces that are no smaller it counts where their edges cross.
+constexpr float LARGE_FACE = 0x1p-3f;
+// Faces are parallel whose normals have no greater product.
+constexpr float PARALLEL = -0.998f;
 
 struct NearOffer {
     typedef NearestFaces N;
@@ -62,6 +66,24 @@ struct NearOffer {
         }
     };
     static CUDA_CALLABLE Scores::Vector vector_of(const Point& p) { return {p.x, p.y, p.z}; }
+    static CUDA_CALLABLE lanes face_size(const Point (&c)[3]) {
+        return N::most(N::largest(F::minus(c[1], c[0])), N::largest(F::minus(c[2], c[0])));
+    }
+    // Rates the points over one another of edges that cross, seen along a normal: corners of what faces share.
+    static CUDA_CALLABLE void offer_crossings(const N::Corners& c, const Point& normal, float gap, float weight,
+                                              const lanes& slack, const bits& counts, Scores& scores) {
+        lanes s;
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j) {
+                const Point e = F::minus(c.a[(i + 1) % 3], c.a[i]), f = F::minus(c.b[(j + 1) % 3], c.b[j]);
+                const Point v = N::between_edges(F::minus(c.b[j], c.a[i]), e, f, N::invert(F::dot(e, e)),
+                                                 N::invert(F::dot(f, f)), s);
+                const lanes height = F::dot(v, normal), square = height * height;
+                const bits over = F::dot(v, v) <= F::fuse(square, lanes{} + (1.0f + 0x1p-6f), slack * slack);
+                const bits near = (height <= gap) & (height >= -gap);
+                scores.offer(weight, vector_of(N::add(c.a[i], s, e)), height, counts & over & near);
+            }
+    }
     static CUDA_CALLABLE Scores rate(const N::Corners& c, float gap, float weight, const float* directions) {
         const lanes zero = {};
         Joined joined;
@@ -103,6 +125,11 @@ struct NearOffer {
             scores.offer(weight, vector_of(joined.corner[k]), joined.height[k],
                          counts & column & (separation >= 0.0f) & near);
         }
+        const lanes smaller = N::least(face_size(c.a), face_size(c.b));
+        const bits large = counts & column & (separation >= 0.0f) & (smaller * weight >= LARGE_FACE * gap) &
+                           (F::dot(joined.normal_a, joined.normal_b) <= PARALLEL);
+        if (F::any(large))
+            offer_crossings(c, joined.normal_a, gap, weight, size * 0x1p-20f, large, scores);
         return scores;
     }
     // Where the slots are that scores belong in, and how many: of what is inside the deepest alone.
