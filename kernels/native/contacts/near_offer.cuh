@@ -70,19 +70,27 @@ struct NearOffer {
         return N::most(N::largest(F::minus(c[1], c[0])), N::largest(F::minus(c[2], c[0])));
     }
     // Rates the points over one another of edges that cross, seen along a normal: corners of what faces share.
-    static CUDA_CALLABLE void offer_crossings(const N::Corners& c, const Point& normal, float gap, float weight,
+    static CUDA_CALLABLE void offer_crossings(N::Corners c, const Point& normal, float gap, float weight,
                                               const lanes& slack, const bits& counts, Scores& scores) {
         lanes s;
-        for (int i = 0; i < 3; ++i)
+        // One edge of A after the other, so that a GPU needs no stack.
+#pragma unroll 1
+        for (int i = 0; i < 3; ++i) {
+            const Point e = F::minus(c.a[1], c.a[0]);
             for (int j = 0; j < 3; ++j) {
-                const Point e = F::minus(c.a[(i + 1) % 3], c.a[i]), f = F::minus(c.b[(j + 1) % 3], c.b[j]);
-                const Point v = N::between_edges(F::minus(c.b[j], c.a[i]), e, f, N::invert(F::dot(e, e)),
+                const Point f = F::minus(c.b[(j + 1) % 3], c.b[j]);
+                const Point v = N::between_edges(F::minus(c.b[j], c.a[0]), e, f, N::invert(F::dot(e, e)),
                                                  N::invert(F::dot(f, f)), s);
                 const lanes height = F::dot(v, normal), square = height * height;
                 const bits over = F::dot(v, v) <= F::fuse(square, lanes{} + (1.0f + 0x1p-6f), slack * slack);
                 const bits near = (height <= gap) & (height >= -gap);
-                scores.offer(weight, vector_of(N::add(c.a[i], s, e)), height, counts & over & near);
+                scores.offer(weight, vector_of(N::add(c.a[0], s, e)), height, counts & over & near);
             }
+            const Point first = c.a[0];
+            c.a[0] = c.a[1];
+            c.a[1] = c.a[2];
+            c.a[2] = first;
+        }
     }
     static CUDA_CALLABLE Scores rate(const N::Corners& c, float gap, float weight, const float* directions) {
         const lanes zero = {};
