@@ -10,7 +10,7 @@ from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair
 wp.set_module_options(native.options())
 
 # Corners of a triangle within the column of another, at most.
-COLUMN_CORNERS = wp.constant(native.constant("COLUMN_CORNERS"))
+COLUMN_CORNERS = native.constant("COLUMN_CORNERS")
 # Depth of a column that holds no corner.
 NO_DEPTH = wp.constant(wp.float64(-wp.inf))
 

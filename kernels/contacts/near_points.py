@@ -22,10 +22,10 @@ wp.set_module_options(native.options("contacts/candidates.cuh", "exact/double_wo
 
 # A face's normal serves where the other face looks against it within 60 degrees.
 OPPOSED_LEAST = wp.constant(wp.float64(0.5))
-# Cosine between a face's normal and the direction of the distance under which the gap differs by more than `ALIKE`.
+# Cosine under which normals differ by more than rounding, and the gap along one from the distance by a part.
 ALONG = wp.constant(wp.float64(0.998))
 
-# Distance, at unit size, under which faces touch.
+# Distance and depth, at unit size, under which faces touch.
 NO_DISTANCE = wp.constant(wp.float64(2.0**-30))
 # Cosine between the direction of a distance and a face's normal from which on the face does not look away from it; one
 # that is closer to the plane of one face of an edge is far from that of the other.

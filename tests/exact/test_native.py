@@ -15,6 +15,7 @@ from warp_abtree import kernels
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.poses import COORDINATE_MIN
 from warp_abtree.kernels.contacts.contact import SHORTEST_NORMAL
+from warp_abtree.kernels.contacts.near_points import ALONG, NO_DISTANCE
 from warp_abtree.kernels.contacts.separation import CLOSEST, LEAST_SEPARATION
 from warp_abtree.kernels.distance import within
 from warp_abtree.kernels.exact.double_word import BOUND_DOUBLE
@@ -26,7 +27,7 @@ from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR
 
 DOUBLES = {"BOUND_2D": BOUND_2D, "BOUND_3D": BOUND_3D, "BOUND_DOUBLE": BOUND_DOUBLE, "COORDINATE_MIN": COORDINATE_MIN}
 DOUBLES |= {"RELATIVE_ERROR": RELATIVE_ERROR, "SHORTEST_NORMAL": SHORTEST_NORMAL, "CLOSEST": CLOSEST}
-DOUBLES |= {"LEAST_SEPARATION": LEAST_SEPARATION}
+DOUBLES |= {"LEAST_SEPARATION": LEAST_SEPARATION, "ALONG": ALONG, "NO_DISTANCE": NO_DISTANCE}
 PASSES = ("resolve_rounded", "float64_filter", "resolve_inexact")
 # Approximate on purpose, or without arithmetic.
 OTHERS = re.compile(r"\.(collapse|heap|quadric|vertex_forest|lod|arrays|native)\b")

@@ -15,7 +15,6 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, flag, to_numpy, whole_number
 from warp_abtree.checks.radix_sort import radix_sort
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.inside import point_distance as kernels
 from warp_abtree.model.mesh import COORDINATE_MAX
@@ -101,9 +100,10 @@ def _measure(scene, asked, points, within, names) -> tuple:
         raise ValueError(f"points: on {points.device}, the model or scene is on {device}")
     rows, lower, upper = _bound_on_gpu(points) if stays else _bound_on_host(points, device)
     n = len(rows)
-    found = zeros_of(kernels.PointDistances, n, 0, device)
-    if "nearest" not in names:
-        found.nearest = wp.empty(0, dtype=wp.vec3d, device=device)
+    found = kernels.PointDistances()
+    for name, variable in kernels.PointDistances.vars.items():
+        room = n if name != "nearest" or name in names else 0
+        setattr(found, name, wp.empty(room, dtype=variable.type.dtype, device=device))
     if n:
         asked = wp.array(np.asarray(asked, np.int32), dtype=wp.vec2i, device=device)
         inputs = [wp.float64(most), batch.trees, asked, rows, _sort(rows, lower, upper), found]

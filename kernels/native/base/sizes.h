@@ -141,6 +141,8 @@ constexpr double RELATIVE_ERROR = 0x1p-42;
 constexpr double SHORTEST_NORMAL = 0x1p-20;
 constexpr double LEAST_SEPARATION = 0x1p-126;
 constexpr double CLOSEST = 0x1p-60;
+constexpr double ALONG = 0x1.fef9db22d0e56p-1;
+constexpr double NO_DISTANCE = 0x1p-30;
 constexpr int CHUNK = 32;
 
 // Twists by which contact points are chosen, one a thread of a block: random ones, then turns about lines at the rim.

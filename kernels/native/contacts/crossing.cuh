@@ -7,10 +7,6 @@
 
 // A face's own normal serves in place of the loop's within 60 degrees of it.
 constexpr double LIKENESS = 0.5;
-// Cosine under which normals differ by more than rounding.
-constexpr double ALONG = 0.998;
-// Distance and depth, at unit size, under which faces touch.
-constexpr double NO_DISTANCE = 0x1p-30;
 // More than any, in offers to slots.
 constexpr float NO_DEPTH_SEPARATION = 0x1p60f;
 

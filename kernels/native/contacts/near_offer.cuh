@@ -10,8 +10,6 @@ constexpr float LOOKS_AT = -0.5f;
 constexpr float FAR_AWAY = 0x1p60f;
 // Of the smaller object's size: of parallel faces that are no smaller it counts where their edges cross.
 constexpr float LARGE_FACE = 0x1p-3f;
-// Faces are parallel whose normals have no greater product.
-constexpr float PARALLEL = -0.998f;
 
 struct NearOffer {
     typedef NearestFaces N;
@@ -135,7 +133,7 @@ struct NearOffer {
         }
         const lanes smaller = N::least(face_size(c.a), face_size(c.b));
         const bits large = counts & column & (separation >= 0.0f) & (smaller * weight >= LARGE_FACE * gap) &
-                           (F::dot(joined.normal_a, joined.normal_b) <= PARALLEL);
+                           (F::dot(joined.normal_a, joined.normal_b) <= (float)-ALONG);
         if (F::any(large))
             offer_crossings(c, joined.normal_a, gap, weight, size * 0x1p-20f, large, scores);
         return scores;
