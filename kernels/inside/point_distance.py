@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees, no_vector
-from warp_abtree.kernels.base.lanes import warp_any, warp_max
+from warp_abtree.kernels.base.lanes import warp_any, warp_lane, warp_max, warp_size
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.inside.nearest_face import (
@@ -72,17 +72,23 @@ def bound_point_kernel(
 
 @wp.kernel(module_options=MODULE_OPTIONS, module="unique")
 def code_point_kernel(
-    lower: wp.vec3d,
-    cell: wp.float64,
+    bounds: wp.array(dtype=wp.float64),
     points: wp.array(dtype=wp.vec3d),
     code_out: wp.array(dtype=wp.int32),
     order_out: wp.array(dtype=wp.int32),
 ):
-    """Write the Morton codes of points on a grid of cells from a corner on; those beyond it have the last cell's."""
+    """Write the Morton codes of points on a grid of cells over their box; those at its end have the last cell's.
+
+    Args:
+        bounds: Of `bound_point_kernel`.
+    """
     i = wp.tid()
-    code = wp.int32(0)
+    code, widest = wp.int32(0), wp.float64(0.0)
     for k in range(3):
-        place = wp.clamp((points[i][k] - lower[k]) / cell, wp.float64(0.0), wp.float64((1 << CODE_BITS) - 1))
+        widest = wp.max(widest, bounds[3 + k] - bounds[k])
+    cell = wp.where(widest > wp.float64(0.0), widest / wp.float64(1 << CODE_BITS), wp.float64(1.0))
+    for k in range(3):
+        place = wp.clamp((points[i][k] - bounds[k]) / cell, wp.float64(0.0), wp.float64((1 << CODE_BITS) - 1))
         code |= spread_bits(wp.int32(place)) << k
     code_out[i] = code
     order_out[i] = i
@@ -222,6 +228,7 @@ def measure_point_kernel(
     asked: wp.array(dtype=wp.vec2i),
     points: wp.array(dtype=wp.vec3d),
     order: wp.array(dtype=wp.int32),
+    bounds: wp.array(dtype=wp.float64),
     found_out: PointDistances,
 ):
     """Write the least distances of points from some objects, negative inside, and where they are nearest.
@@ -231,7 +238,10 @@ def measure_point_kernel(
         within: Surfaces farther away are not looked for: distances are infinite.
         asked: Objects, rising, and whether they have an inside.
         order: Indices of points, neighbours beside each other.
+        bounds: Of `bound_point_kernel`; where a point is bad, nothing is written.
     """
+    if bounds[6] < wp.float64(wp.inf):
+        return
     last = LastPoint()
     last.place = -1
     for k in range(run):
@@ -270,15 +280,21 @@ def measure_point_kernel(
 
 @wp.kernel(module_options=WARP_OPTIONS, module="unique", cuda_max_registers=128)
 def measure_points_of_warp_kernel(
+    at_once: wp.int32,
     within: wp.float64,
     trees: Trees,
     asked: wp.array(dtype=wp.vec2i),
     points: wp.array(dtype=wp.vec3d),
     order: wp.array(dtype=wp.int32),
+    bounds: wp.array(dtype=wp.float64),
     found_out: PointDistances,
 ):
-    """Write what `measure_point_kernel` does, a point a lane."""
-    i = wp.tid()
+    """Write what `measure_point_kernel` does, some points a warp, one in each of its first lanes."""
+    if bounds[6] < wp.float64(wp.inf):
+        return
+    place = warp_lane()
+    i = wp.tid() / warp_size() * at_once + place
+    is_mine = place < at_once and i < points.shape[0]
     q = order[wp.min(i, points.shape[0] - 1)]
     answer = no_answer(within)
     most = wp.float64(within)
@@ -289,7 +305,7 @@ def measure_points_of_warp_kernel(
         o = asked[j][0]
         placed = place_point(trees, o, points[q])
         placed.solid.margin = warp_max(placed.solid.margin)
-        meets = i < points.shape[0] and may_be_nearer(placed, wp.min(answer.least, most))
+        meets = is_mine and may_be_nearer(placed, wp.min(answer.least, most))
         inside = bool(False)
         if meets and asked[j][1] != 0:
             inside = is_inside(trees, placed.pose, False, placed.centre, placed.point)
@@ -299,5 +315,5 @@ def measure_points_of_warp_kernel(
             distance, face = nearest_faces_of_warp(trees, placed.pose, placed.solid, asks, placed.point, limit)
             if asks:
                 offer_object(answer, o, inside, distance, face)
-    if i < points.shape[0]:
+    if is_mine:
         report_point(trees, q, points[q], answer, found_out)

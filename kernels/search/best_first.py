@@ -27,7 +27,7 @@ from warp_abtree.kernels.search.load_balance import (
     donate_items,
     load_tickets,
 )
-from warp_abtree.kernels.search.nearest_stack import SearchMemory, put_nearest_last
+from warp_abtree.kernels.search.nearest_stack import SearchMemory, put_nearer_last, put_nearest_last
 from warp_abtree.kernels.search.warp_stack import read_item
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -107,8 +107,8 @@ def place_of_lane(count: wp.int32):
 
 
 @functools.cache
-def list_functions(memory: SearchMemory):
-    """Return the functions that take an entry a lane, and that append what an item emits."""
+def list_functions(memory: SearchMemory, shift: int):
+    """Return the functions that take an entry a lane, and that append what an item emits, two or four."""
     read_bound, read_slot, write_entry = memory.read_bound, memory.read_slot, memory.write_entry
     leaf_start, mask = memory.stack_length, memory.mask
 
@@ -129,8 +129,11 @@ def list_functions(memory: SearchMemory):
     def push_emitted(lists: wp.ref[SearchLists], emitted: Emitted, slot: wp.int32):
         """Append node pairs to the stack, the best of each lane last, and leaf pairs to theirs."""
         kinds, items, bounds = emitted.kinds, emitted.items, emitted.bounds
-        put_nearest_last(kinds, items, bounds)
-        for k in range(4):
+        if wp.static(shift == 1):
+            put_nearer_last(kinds, items, bounds)
+        else:
+            put_nearest_last(kinds, items, bounds)
+        for k in range(wp.static(1 << shift)):
             node, face = kinds[k] == NODES, kinds[k] == FACES
             place = next_place(lists.end, node) & wp.static(mask)
             leaf_place = wp.static(leaf_start) + next_place(lists.waiting, face)
@@ -148,7 +151,7 @@ def best_first(policy: BestFirstPolicy):
     refresh, expand, leaf, open_pairs = policy.refresh, policy.expand, policy.leaf, policy.open
     turns, donates, shift = policy.turns, policy.donates, policy.shift
     leaf_start, open_start, mask = policy.memory.stack_length, policy.memory.open_start, policy.memory.mask
-    take_entry, push_emitted = list_functions(policy.memory)
+    take_entry, push_emitted = list_functions(policy.memory, shift)
 
     @wp.func
     def search_best_first(trees: Trees, given: given_type, state: wp.ref[state_type], lists: wp.ref[SearchLists]):

@@ -55,6 +55,11 @@ def put_nearest_last(kinds: wp.ref[wp.vec4i], children: wp.ref[four_items], boun
     """Sort children by falling bounds."""
 
 
+@native.func_native()
+def put_nearer_last(kinds: wp.ref[wp.vec4i], children: wp.ref[four_items], bounds: wp.ref[wp.vec4]):
+    """Sort the first two children so, where there are no others."""
+
+
 @wp.func
 def only_slot(items: wp.uint64, i: wp.int32):
     return 0

@@ -26,6 +26,8 @@ from warp_abtree.scene.posed_objects import PosedObjects
 
 # Points of a thread of the CPU: the next starts from the last one's nearest face.
 RUN = 256
+# Points of a warp: with more the last warps run alone, with fewer lanes wait.
+POINTS_OF_WARP = 8
 # Models whose device arrays are kept for the next call.
 KEPT_MODELS = 4
 BOUND_THREADS = 4096
@@ -98,7 +100,7 @@ def _measure(scene, asked, points, within, names) -> tuple:
     batch, device, stays = scene.batch(), scene.device, _is_on_gpu(points)
     if stays and points.device != device:
         raise ValueError(f"points: on {points.device}, the model or scene is on {device}")
-    rows, lower, upper = _bound_on_gpu(points) if stays else _bound_on_host(points, device)
+    rows, bounds = _bound_on_gpu(points) if stays else _bound_on_host(points, device)
     n = len(rows)
     found = kernels.PointDistances()
     for name, variable in kernels.PointDistances.vars.items():
@@ -106,12 +108,14 @@ def _measure(scene, asked, points, within, names) -> tuple:
         setattr(found, name, wp.empty(room, dtype=variable.type.dtype, device=device))
     if n:
         asked = wp.array(np.asarray(asked, np.int32), dtype=wp.vec2i, device=device)
-        inputs = [wp.float64(most), batch.trees, asked, rows, _sort(rows, lower, upper), found]
+        inputs = [wp.float64(most), batch.trees, asked, rows, _sort(rows, bounds), bounds, found]
+        kernel, run, lanes = kernels.measure_point_kernel, RUN, 1
         if current_regime().uses_warps(device):
-            threads = -(-n // WARP_SIZE) * WARP_SIZE
-            wp.launch(kernels.measure_points_of_warp_kernel, threads, inputs, device=device, block_dim=WARP_SIZE)
-        else:
-            wp.launch(kernels.measure_point_kernel, -(-n // RUN), [RUN, *inputs], device=device)
+            kernel = kernels.measure_points_of_warp_kernel
+            run, lanes = (POINTS_OF_WARP, WARP_SIZE) if device.is_cuda else (1, 1)
+        wp.launch(kernel, -(-n // run) * lanes, [run, *inputs], device=device, block_dim=WARP_SIZE)
+    if stays:
+        _check_on_gpu(points, bounds)
     return tuple(getattr(found, name) if stays else getattr(found, name).numpy() for name in names)
 
 
@@ -126,7 +130,7 @@ def _refuse(i: int, is_finite: bool):
 
 
 def _bound_on_host(points, device) -> tuple:
-    """Return points as an array of the device, and the corners of their box; raise ValueError for bad ones."""
+    """Return points as an array of the device, and what `bound_point_kernel` finds; raise ValueError for bad ones."""
     points = to_numpy(points, "points")
     if points.shape == (0,):
         points = np.empty((0, 3))
@@ -138,29 +142,32 @@ def _bound_on_host(points, device) -> tuple:
         _refuse(near.argmin() if finite.all() else finite.argmin(), finite.all())
     # NumPy takes ten times as long along the first axis.
     corners = np.array([(column.min(), column.max()) for column in points.T]) if len(points) else np.zeros((3, 2))
-    return wp.array(points, dtype=wp.vec3d, device=device), *corners.T
+    bounds = wp.array([*corners.T.ravel(), np.inf], dtype=wp.float64, device=device)
+    return wp.array(points, dtype=wp.vec3d, device=device), bounds
 
 
 def _bound_on_gpu(points: wp.array) -> tuple:
-    """Return the same of points that are there. Waits for the device."""
+    """Return the same of points that are there, without a look at them."""
     limits = np.repeat([np.inf, -np.inf, np.inf], (3, 3, 1))
     bounds = wp.array(limits, dtype=wp.float64, device=points.device)
     inputs = [BOUND_THREADS, wp.float64(COORDINATE_MAX), points, bounds]
     wp.launch(kernels.bound_point_kernel, BOUND_THREADS, inputs, device=points.device)
-    limits = bounds.numpy()
-    if np.isfinite(limits[6]):
-        bad = int(limits[6])
+    return points, bounds
+
+
+def _check_on_gpu(points: wp.array, bounds: wp.array):
+    """Raise ValueError for the first bad point. Waits for the device."""
+    first = bounds.numpy()[6]
+    if np.isfinite(first):
+        bad = int(first)
         _refuse(bad, np.isfinite(points[bad : bad + 1].numpy()).all())
-    return points, limits[:3], limits[3:6]
 
 
-def _sort(rows: wp.array, lower, upper) -> wp.array:
+def _sort(rows: wp.array, bounds: wp.array) -> wp.array:
     """Return indices of points along a Morton curve through their box."""
-    cell = float((upper - lower).max()) / 2 ** int(kernels.CODE_BITS)
     code, order = (wp.empty(2 * len(rows), dtype=wp.int32, device=rows.device) for _ in range(2))
-    inputs = [wp.vec3d(*lower), wp.float64(cell or 1.0), rows, code, order]
-    wp.launch(kernels.code_point_kernel, len(rows), inputs, device=rows.device)
-    radix_sort(code, order, len(rows), 32)
+    wp.launch(kernels.code_point_kernel, len(rows), [bounds, rows, code, order], device=rows.device)
+    radix_sort(code, order, len(rows), 3 * int(kernels.CODE_BITS))
     return order
 
 

@@ -26,24 +26,27 @@ inline CUDA_CALLABLE void write_bound(wp::uint64 items, wp::int32 i, wp::float32
     *entry<volatile float>(items, 2 * NEAREST_LENGTH + i) = bound;
 }
 
+// The nearer of two children comes last, so that it is taken first.
+inline CUDA_CALLABLE void put_nearer_last(wp::vec_t<4, wp::int32>& kinds, wp::vec_t<4, wp::int64>& children,
+                                          wp::vec_t<4, wp::float32>& bounds, int i = 0, int j = 1) {
+    const bool turn = bounds[i] < bounds[j];
+    const float bound = bounds[i];
+    const long long child = children[i];
+    const int kind = kinds[i];
+    bounds[i] = turn ? bounds[j] : bound;
+    bounds[j] = turn ? bound : bounds[j];
+    children[i] = turn ? children[j] : child;
+    children[j] = turn ? child : children[j];
+    kinds[i] = turn ? kinds[j] : kind;
+    kinds[j] = turn ? kind : kinds[j];
+}
+
 inline CUDA_CALLABLE void put_nearest_last(wp::vec_t<4, wp::int32>& kinds, wp::vec_t<4, wp::int64>& children,
                                            wp::vec_t<4, wp::float32>& bounds) {
-    // The nearest comes last, so that it is taken first.
-    int order[5][2] = {{0, 1}, {2, 3}, {0, 2}, {1, 3}, {1, 2}};
+    const int order[5][2] = {{0, 1}, {2, 3}, {0, 2}, {1, 3}, {1, 2}};
 #pragma unroll
-    for (int n = 0; n < 5; ++n) {
-        const int i = order[n][0], j = order[n][1];
-        const bool turn = bounds[i] < bounds[j];
-        const float bound = bounds[i];
-        const long long child = children[i];
-        const int kind = kinds[i];
-        bounds[i] = turn ? bounds[j] : bound;
-        bounds[j] = turn ? bound : bounds[j];
-        children[i] = turn ? children[j] : child;
-        children[j] = turn ? child : children[j];
-        kinds[i] = turn ? kinds[j] : kind;
-        kinds[j] = turn ? kind : kinds[j];
-    }
+    for (int n = 0; n < 5; ++n)
+        put_nearer_last(kinds, children, bounds, order[n][0], order[n][1]);
 }
 
 inline CUDA_CALLABLE void push_in_order(wp::uint64 items, wp::int32& end, wp::vec_t<4, wp::int32> kinds,
