@@ -122,11 +122,29 @@ def point_weights(near: Features):
 
 
 @wp.func
+def face_distance(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d):
+    """Return the distance of a point from a face."""
+    near, size = point_features(a, b, c, point)
+    return wp.sqrt(near.square) * size
+
+
+@wp.func
 def point_distance(trees: Trees, pose: PairPose, solid: Solid, face: wp.int32, point: wp.vec3d):
     """Return the distance of a point in A's frame from an active face of an object."""
     a, b, c = load_posed_face(trees, pose, solid.of_b, face)
-    near, size = point_features(a, b, c, point)
-    return wp.sqrt(near.square) * size
+    return face_distance(a, b, c, point)
+
+
+@wp.func
+def bound_face(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d):
+    """Return how far a face lies from a point along the way to its middle, times the length of that; and its square.
+
+    The first is 0 where it lies on both sides. No point of the face is nearer (docs/exactness.md, bound 24).
+    """
+    u, v, w = a - point, b - point, c - point
+    g = (u + v) + w
+    along = wp.min(wp.min(wp.dot(g, u), wp.dot(g, v)), wp.dot(g, w))
+    return wp.max(along, wp.float64(0.0)), wp.dot(g, g)
 
 
 @wp.func
@@ -180,7 +198,11 @@ def nearest_face_within(
             bound[end + 1] = squares[1 - turn]
             end += 2
         elif live:
-            d = point_distance(trees, pose, solid, ~below, point)
+            a, b, c = load_posed_face(trees, pose, solid.of_b, ~below)
+            along, square = bound_face(a, b, c, point)
+            d = wp.float64(wp.inf)
+            if not along * along > limit * square:
+                d = face_distance(a, b, c, point)
             if d < least or (d == least and ~below < face):
                 face = ~below
                 if d < least:

@@ -14,14 +14,16 @@ from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.inside.nearest_face import (
     NO_NEAREST,
     Solid,
+    bound_face,
     into_frame,
     open_node,
     point_distance,
     square_outside,
 )
+from warp_abtree.kernels.inside.parity import load_posed_face
 from warp_abtree.kernels.search.best_first import BestFirstPolicy, Entry, SearchLists, best_first, start_lists
 from warp_abtree.kernels.search.item import FACES, NODES, Emitted, item_first, item_second, pack_item
-from warp_abtree.kernels.search.nearest_stack import NEAREST_MEMORY, nearest_stack, write_bounded
+from warp_abtree.kernels.search.nearest_stack import NEAREST_MEMORY, nearest_stack, push_open, write_bounded
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -54,7 +56,10 @@ def face_of_slot(slot: wp.int32) -> wp.int32: ...
 
 @native.func_native()
 def offer_point_face(live: bool, slot: wp.int32, distance: wp.float64, face: wp.int32, none: wp.int32):
-    """Offer a face a lane to a slot, which keeps the nearest, the lowest of several. For all lanes."""
+    """Offer a face a lane to a slot, which keeps the nearest, the lowest of several. For all lanes.
+
+    No face stands for one at most as far away, which is offered later.
+    """
 
 
 @wp.func
@@ -85,6 +90,25 @@ def open_nodes_of_points(trees: Trees, given: wp.int32, search: wp.ref[PointsSea
 
 
 @wp.func
+def bound_faces_of_points(
+    trees: Trees, given: wp.int32, search: wp.ref[PointsSearch], lists: wp.ref[SearchLists], entry: Entry
+):
+    """Bound a face a lane from both sides: one that may be nearest waits, and the nearest corner bounds the slot."""
+    face, slot, solid = item_first(entry.item), item_second(entry.item), search.solid
+    live = entry.live and wp.float64(entry.bound) <= square_limit(solid, slot)
+    point, most, least = point_of_slot(slot), wp.float64(0.0), wp.float64(0.0)
+    if live:
+        a, b, c = load_posed_face(trees, search.pose, solid.of_b, face)
+        along, square = bound_face(a, b, c, point)
+        least = wp.where(square > wp.float64(0.0), along / square * along, wp.float64(0.0))
+        corner = wp.min(wp.min(wp.length_sq(a - point), wp.length_sq(b - point)), wp.length_sq(c - point))
+        most = (wp.sqrt(corner) + solid.margin) * solid.grow
+    offer_point_face(live, slot, most, NO_NEAREST, NO_NEAREST)
+    live = live and not least > square_limit(solid, slot)
+    push_open(lists.items, lists.opened, live, entry.item, round_down(least))
+
+
+@wp.func
 def measure_faces_of_points(
     trees: Trees, given: wp.int32, search: wp.ref[PointsSearch], lists: wp.ref[SearchLists], entry: Entry
 ):
@@ -104,7 +128,7 @@ search_points = best_first(
         PointsSearch,
         None,
         open_nodes_of_points,
-        measure_faces_of_points,
+        bound_faces_of_points,
         measure_faces_of_points,
         shift=1,
     )

@@ -28,7 +28,8 @@ def points_about(rng, corners, count):
     on = np.einsum("nk,nkx->nx", weights / weights.sum(1, keepdims=True), corners[rng.integers(0, len(corners), count)])
     near = on + rng.normal(size=on.shape) * size * 10.0 ** rng.uniform(-16, -1, (count, 1))
     around = low + size * rng.uniform(-0.5, 1.5, (count, 3))
-    return np.concatenate([around, near, on, corners.reshape(-1, 3)[:count], 1e6 * size * around[: count // 4]])
+    far = [scale * around[: count // 4] for scale in (1e6 * size, 2.0**298 / np.abs(around).max())]
+    return np.concatenate([around, near, on, corners.reshape(-1, 3)[:count], *far])
 
 
 @pytest.mark.parametrize(("name", "scale"), [*((name, 1.0) for name in NAMES), ("soup", 1e-6), ("crumbs", 1e6)])
@@ -100,13 +101,19 @@ def test_points_do_not_see_one_another(device, monkeypatch):
 def test_warps_and_threads_have_the_same_bits(device, within):
     """Of a model at two LODs, and of a scene with solids and open objects, far from some of them."""
     rng, model = np.random.default_rng(5), sample("torus")
-    points = np.concatenate([rng.uniform(-1.5, 1.5, (400, 3)), model.mesh_at(model.lod_max)[0][:70]])
+    vertices, faces, _ = model.mesh_at(model.lod_max)
+    points = np.concatenate([rng.uniform(-1.5, 1.5, (400, 3)), points_about(rng, vertices[faces], 30)])
     scene = ab.Scene(device)
     for k in range(5):
         scene.add(sample("small ball"), pose=(0.7 * k - 1.2, 0.1 * k, 0, 0, 0, 0, 1), solid=k % 2 == 0)
+    flat, middle = (
+        ab.Model.from_arrays(np.float64([[0, 0, 0], [3, 0, 0], [0, 3, 0]]), np.int32([[0, 1, 2]])),
+        [[1.0, 1, 0]],
+    )
     answers = []
     for warps in (True, False):
         with testing.regime(warps=warps):
+            assert ab.signed_distance(flat, middle, device=device, signed=False) == 0.0
             found = [
                 ab.signed_distance(model, points, lod, device, nearest=True, within=within)
                 for lod in (model.lod_max, model.lod_max // 4)

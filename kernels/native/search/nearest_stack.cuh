@@ -26,9 +26,8 @@ inline CUDA_CALLABLE void write_bound(wp::uint64 items, wp::int32 i, wp::float32
     *entry<volatile float>(items, 2 * NEAREST_LENGTH + i) = bound;
 }
 
-// The nearer of two children comes last, so that it is taken first.
-inline CUDA_CALLABLE void put_nearer_last(wp::vec_t<4, wp::int32>& kinds, wp::vec_t<4, wp::int64>& children,
-                                          wp::vec_t<4, wp::float32>& bounds, int i = 0, int j = 1) {
+inline CUDA_CALLABLE void put_in_turn(wp::vec_t<4, wp::int32>& kinds, wp::vec_t<4, wp::int64>& children,
+                                      wp::vec_t<4, wp::float32>& bounds, int i, int j) {
     const bool turn = bounds[i] < bounds[j];
     const float bound = bounds[i];
     const long long child = children[i];
@@ -41,12 +40,18 @@ inline CUDA_CALLABLE void put_nearer_last(wp::vec_t<4, wp::int32>& kinds, wp::ve
     kinds[j] = turn ? kind : kinds[j];
 }
 
+// The nearest comes last, so that it is taken first.
+inline CUDA_CALLABLE void put_nearer_last(wp::vec_t<4, wp::int32>& kinds, wp::vec_t<4, wp::int64>& children,
+                                          wp::vec_t<4, wp::float32>& bounds) {
+    put_in_turn(kinds, children, bounds, 0, 1);
+}
+
 inline CUDA_CALLABLE void put_nearest_last(wp::vec_t<4, wp::int32>& kinds, wp::vec_t<4, wp::int64>& children,
                                            wp::vec_t<4, wp::float32>& bounds) {
     const int order[5][2] = {{0, 1}, {2, 3}, {0, 2}, {1, 3}, {1, 2}};
 #pragma unroll
     for (int n = 0; n < 5; ++n)
-        put_nearer_last(kinds, children, bounds, order[n][0], order[n][1]);
+        put_in_turn(kinds, children, bounds, order[n][0], order[n][1]);
 }
 
 inline CUDA_CALLABLE void push_in_order(wp::uint64 items, wp::int32& end, wp::vec_t<4, wp::int32> kinds,
