@@ -56,7 +56,7 @@ def run(device, quick=False, only=PARTS):
             for peer_signed in (True,) if model.winding.is_closed else (False, True):
                 yield measure_points(name, model, device, 300 if quick else POINTS, peer_signed)
         torus = ab.Model.load(trimesh.creation.torus(1.0, 0.4, *((24, 12) if quick else (96, 48))))
-        yield measure_points("torus", torus, device, 300 if quick else POINTS)
+        yield measure_points("torus", torus, device, 300 if quick else POINTS, True)
     if "gap" in only:
         sizes = GAP_QUICK if quick else GAP_FULL
         knots = knot_model(sizes["faces"])
@@ -96,7 +96,7 @@ def ask_mesh_kernel(
         distance_out[i] = wp.length(points[i] - wp.mesh_eval_position(mesh, near.face, near.u, near.v))
 
 
-def measure_points(name, model, device, count, peer_signed=True):
+def measure_points(name, model, device, count, peer_signed):
     """Return the row of random points about one mesh, with signs where it is closed."""
     rng, (vertices, faces, _) = np.random.default_rng(0), model.mesh_at(model.lod_max)
     low, size, signed = vertices.min(0), np.ptp(vertices, axis=0), model.winding.is_closed

@@ -122,7 +122,7 @@ def point_weights(near: Features):
 
 
 @wp.func
-def face_distance(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d):
+def distance_from_face(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d):
     """Return the distance of a point from a face."""
     near, size = point_features(a, b, c, point)
     return wp.sqrt(near.square) * size
@@ -132,7 +132,7 @@ def face_distance(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d):
 def point_distance(trees: Trees, pose: PairPose, solid: Solid, face: wp.int32, point: wp.vec3d):
     """Return the distance of a point in A's frame from an active face of an object."""
     a, b, c = load_posed_face(trees, pose, solid.of_b, face)
-    return face_distance(a, b, c, point)
+    return distance_from_face(a, b, c, point)
 
 
 @wp.func
@@ -202,7 +202,7 @@ def nearest_face_within(
             along, square = bound_face(a, b, c, point)
             d = wp.float64(wp.inf)
             if not along * along > limit * square:
-                d = face_distance(a, b, c, point)
+                d = distance_from_face(a, b, c, point)
             if d < least or (d == least and ~below < face):
                 face = ~below
                 if d < least:

@@ -16,7 +16,6 @@ from warp_abtree.kernels.inside.nearest_face import (
     Solid,
     bound_face,
     into_frame,
-    open_node,
     point_distance,
     square_outside,
 )
@@ -38,8 +37,8 @@ class PointsSearch:
 
 
 @native.func_native()
-def put_point(slot: wp.int32, point: wp.vec3d, most: wp.float64, none: wp.int32):
-    """Put a point into a slot, with the distance of faces that count at most, and no face."""
+def put_point(slot: wp.int32, point: wp.vec3d, x: wp.vec3d, most: wp.float64, none: wp.int32):
+    """Put a point into a slot, in A's frame and as boxes see it, with the most that faces count at, and no face."""
 
 
 @native.func_native()
@@ -52,6 +51,19 @@ def least_of_slot(slot: wp.int32) -> wp.float64: ...
 
 @native.func_native()
 def face_of_slot(slot: wp.int32) -> wp.int32: ...
+
+
+@native.func_native()
+def bound_children_of_slot(
+    boxes: wp.array(dtype=wp.vec4),
+    start: wp.int32,
+    node: wp.int32,
+    slot: wp.int32,
+    x: wp.vec3d,
+    bounds: wp.ref[wp.vec2],
+    codes: wp.ref[wp.vec2i],
+):
+    """Find what `open_node` does of a slot's point x, rounded down."""
 
 
 @native.func_native()
@@ -76,16 +88,16 @@ def open_nodes_of_points(trees: Trees, given: wp.int32, search: wp.ref[PointsSea
     slot = item_second(entry.item)
     limit = square_limit(search.solid, slot)
     if entry.live and wp.float64(entry.bound) <= limit:
-        squares, codes = wp.vec2d(), wp.vec2i()
+        bounds, codes = wp.vec2(), wp.vec2i()
         x = into_frame(search.pose, search.solid, point_of_slot(slot))
-        open_node(trees.states.node_box, search.solid.node, item_first(entry.item), x, squares, codes)
+        bound_children_of_slot(trees.states.node_box, search.solid.node, item_first(entry.item), slot, x, bounds, codes)
         emitted.tests = 2
         for k in range(2):
             # Infinite where nothing is active.
-            if squares[k] <= limit and squares[k] < wp.float64(wp.inf):
+            if wp.float64(bounds[k]) <= limit and bounds[k] < wp.inf:
                 emitted.kinds[k] = wp.where(codes[k] < 0, FACES, NODES)
                 emitted.items[k] = pack_item(wp.where(codes[k] < 0, ~codes[k], codes[k]), slot)
-                emitted.bounds[k] = round_down(squares[k])
+                emitted.bounds[k] = bounds[k]
     return emitted
 
 
@@ -141,10 +153,11 @@ def nearest_faces_of_warp(trees: Trees, pose: PairPose, solid: Solid, asks: bool
     search = PointsSearch()
     search.pose = pose
     search.solid = solid
-    put_point(warp_lane(), point, most, NO_NEAREST)
+    x = into_frame(pose, solid, point)
+    put_point(warp_lane(), point, x, most, NO_NEAREST)
     lists = start_lists(nearest_stack(), STACK_LENGTH)
     root = load_node(trees.states, solid.node + 1)
-    square = square_outside(root, into_frame(pose, solid, point))
+    square = square_outside(root, x)
     starts = asks and square <= square_limit(solid, warp_lane()) and square < wp.float64(wp.inf)
     # A single face waits at once.
     place = STACK_LENGTH + next_place(lists.waiting, starts and root.face >= 0)

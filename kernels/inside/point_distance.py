@@ -96,7 +96,7 @@ def code_point_kernel(
 
 @wp.struct
 class PointDistances:
-    """What points are given; all arrays of shape [point]."""
+    """What points are given; all arrays of shape [point], but for those that are not asked, which are empty."""
 
     distance: wp.array(dtype=wp.float64)  # [world units], negative inside
     object: wp.array(dtype=wp.int32)  # -1 for none
@@ -195,11 +195,13 @@ def offer_object(answer: wp.ref[PointAnswer], o: wp.int32, inside: bool, distanc
 
 @wp.func
 def report_point(trees: Trees, q: wp.int32, point: wp.vec3d, answer: PointAnswer, found: PointDistances):
-    """Write the answer of a point in the world, and where that lies on its face, where it is asked."""
+    """Write what is asked of the answer of a point in the world."""
     o, face = answer.object, answer.face
     found.distance[q] = wp.where(o == NO_NEAREST, wp.float64(wp.inf), answer.least)
-    found.object[q] = wp.where(o == NO_NEAREST, -1, o)
-    found.face[q] = wp.where(face == NO_NEAREST, -1, face)
+    if found.object.shape[0] > 0:
+        found.object[q] = wp.where(o == NO_NEAREST, -1, o)
+    if found.face.shape[0] > 0:
+        found.face[q] = wp.where(face == NO_NEAREST, -1, face)
     if found.nearest.shape[0] > 0:
         near = no_vector()
         if face != NO_NEAREST:

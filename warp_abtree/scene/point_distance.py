@@ -7,6 +7,7 @@ holds of R^T (p - t), the point in the frame of an object that R and t pose, as 
 """
 
 import weakref
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -103,11 +104,11 @@ def _measure(scene, asked, points, within, names) -> tuple:
     rows, bounds = _bound_on_gpu(points) if stays else _bound_on_host(points, device)
     n = len(rows)
     found = kernels.PointDistances()
-    for name, variable in kernels.PointDistances.vars.items():
-        room = n if name != "nearest" or name in names else 0
-        setattr(found, name, wp.empty(room, dtype=variable.type.dtype, device=device))
+    for name in names:
+        dtype = kernels.PointDistances.vars[name].type.dtype
+        setattr(found, name, wp.empty(n, dtype=dtype, device=device))
     if n:
-        asked = wp.array(np.asarray(asked, np.int32), dtype=wp.vec2i, device=device)
+        asked = _asked_objects(tuple(map(tuple, asked)), device.alias)
         inputs = [wp.float64(most), batch.trees, asked, rows, _sort(rows, bounds), bounds, found]
         kernel, run, lanes = kernels.measure_point_kernel, RUN, 1
         if current_regime().uses_warps(device):
@@ -117,6 +118,17 @@ def _measure(scene, asked, points, within, names) -> tuple:
     if stays:
         _check_on_gpu(points, bounds)
     return tuple(getattr(found, name) if stays else getattr(found, name).numpy() for name in names)
+
+
+@lru_cache(maxsize=KEPT_MODELS)
+def _asked_objects(asked: tuple, device: str) -> wp.array:
+    return wp.array(np.array(asked, np.int32), dtype=wp.vec2i, device=device)
+
+
+@cache
+def _no_bounds(device: str) -> wp.array:
+    """Return what the box of no points is for `bound_point_kernel`."""
+    return wp.array([np.inf] * 3 + [-np.inf] * 3 + [np.inf], dtype=wp.float64, device=device)
 
 
 def _is_on_gpu(points) -> bool:
@@ -148,8 +160,8 @@ def _bound_on_host(points, device) -> tuple:
 
 def _bound_on_gpu(points: wp.array) -> tuple:
     """Return the same of points that are there, without a look at them."""
-    limits = np.repeat([np.inf, -np.inf, np.inf], (3, 3, 1))
-    bounds = wp.array(limits, dtype=wp.float64, device=points.device)
+    device: Any = points.device
+    bounds = wp.clone(_no_bounds(device.alias))
     inputs = [BOUND_THREADS, wp.float64(COORDINATE_MAX), points, bounds]
     wp.launch(kernels.bound_point_kernel, BOUND_THREADS, inputs, device=points.device)
     return points, bounds
