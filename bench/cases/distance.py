@@ -53,8 +53,8 @@ def run(device, quick=False, only=PARTS):
         folder = ModelFolder(None)
         for name in [name for name in POINT_MESHES if mesh_file(name)][: 1 if quick else None]:
             model = folder.load([name])
-            for peer_signed in (True,) if model.winding.is_closed else (False, True):
-                yield measure_points(name, model, device, 300 if quick else POINTS, peer_signed)
+            for has_signs in (True,) if model.winding.is_closed else (False, True):
+                yield measure_points(name, model, device, 300 if quick else POINTS, has_signs)
         torus = ab.Model.load(trimesh.creation.torus(1.0, 0.4, *((24, 12) if quick else (96, 48))))
         yield measure_points("torus", torus, device, 300 if quick else POINTS, True)
     if "gap" in only:
@@ -96,17 +96,17 @@ def ask_mesh_kernel(
         distance_out[i] = wp.length(points[i] - wp.mesh_eval_position(mesh, near.face, near.u, near.v))
 
 
-def measure_points(name, model, device, count, peer_signed):
-    """Return the row of random points about one mesh, with signs where it is closed."""
+def measure_points(name, model, device, count, has_signs):
+    """Return the row of random points about one mesh, with signs where it is closed; the peer may have signs."""
     rng, (vertices, faces, _) = np.random.default_rng(0), model.mesh_at(model.lod_max)
     low, size, signed = vertices.min(0), np.ptp(vertices, axis=0), model.winding.is_closed
     points = low + size * rng.uniform(-0.1, 1.1, (count, 3))
     near = vertices[rng.integers(0, len(vertices), count // 10)]
     points[: len(near)] = near + rng.normal(size=near.shape) * 0.003 * size.max()
     corners, rows = (wp.array(part, dtype=wp.vec3, device=device) for part in (vertices, points))
-    mesh = wp.Mesh(corners, wp.array(faces.ravel(), dtype=int, device=device), support_winding_number=peer_signed)
+    mesh = wp.Mesh(corners, wp.array(faces.ravel(), dtype=int, device=device), support_winding_number=has_signs)
     found = wp.empty(count, dtype=float, device=device)
-    inputs = [mesh.id, int(peer_signed), rows, found]
+    inputs = [mesh.id, int(has_signs), rows, found]
     asked = points if device.is_cpu else wp.array(points, dtype=wp.vec3d, device=device)
     calls = {
         "ours": lambda: ab.signed_distance(model, asked, device=device.alias, signed=signed),
@@ -118,8 +118,8 @@ def measure_points(name, model, device, count, peer_signed):
         times = time_rounds({who: time_call(call, device, clock) for who, call in calls.items()}, 5)
     truth = calls["host"]()
     row = {"device": device.name, "workload": name, "faces": model.face_count, "points": count, "signed": signed}
-    row |= {"peer_signed": peer_signed, "inside": np.count_nonzero(truth < 0) if signed else None}
-    if signed and peer_signed:
+    row |= {"peer_signed": has_signs, "inside": np.count_nonzero(truth < 0) if signed else None}
+    if signed and has_signs:
         row["peer_wrong_sides"] = np.count_nonzero((truth < 0) != (found.numpy() < 0))
     row |= {f"{who}_us": 1e3 * float(np.median(times[who])) / count for who in calls}
     return row | {"point_ratio": ratio_of(times["peer"], times["ours"])}
