@@ -44,9 +44,9 @@ from warp_abtree.kernels.search.mean_slabs import Slabs, count_uses
 from warp_abtree.kernels.triangle.corners import load_triangles
 from warp_abtree.kernels.triangle.distance import (
     DISTANCE_MAX,
-    EXPONENT_BITS,
     POSE_ROUNDING,
     largest_coordinate,
+    power_below,
     skew_of,
 )
 from warp_abtree.kernels.triangle.triangle_pair import PAIR_ROUNDING, triangle_distance
@@ -132,8 +132,7 @@ def make_scale(trees: Trees, pose: PairPose, a: wp.int32, b: wp.int32):
     margin64 = margin64 + wp.float64(4.0) * skew * (reach_b + far)
     margin = margin64 + ROUNDING_32 * (reach_a + reach_b + far)
     most = wp.max(wp.max(reach_a, reach_b), far)
-    power = wp.cast(wp.cast(most, wp.int64) & EXPONENT_BITS, wp.float64)
-    scale = wp.min(wp.float64(1.0) / power, SCALE_MAX)
+    scale = wp.min(wp.float64(1.0) / power_below(most), SCALE_MAX)
     one = wp.float64(1.0)
     skew_a, skew_b = skew_of(trees.objects.rotation[a]), skew_of(trees.objects.rotation[b])
     sizes = (reach_a + largest_coordinate(centre_a)) + (reach_b + largest_coordinate(centre_b))

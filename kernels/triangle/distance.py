@@ -28,6 +28,12 @@ corners_type = wp.types.matrix(shape=(3, 3), dtype=wp.float64)
 
 
 @wp.func
+def power_below(x: wp.float64):
+    """Return the power of two at or below a number above 0, the exponent without the digits; 0 of 0."""
+    return wp.cast(wp.cast(x, wp.int64) & EXPONENT_BITS, wp.float64)
+
+
+@wp.func
 def largest_coordinate(x: wp.vec3d):
     """Return the largest coordinate in magnitude."""
     return wp.max(wp.max(wp.abs(x[0]), wp.abs(x[1])), wp.abs(x[2]))
@@ -129,8 +135,8 @@ def triangles_near(d: wp.float64, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: 
         wp.max(largest_coordinate(e1), largest_coordinate(e2)),
         wp.max(largest_coordinate(f0), wp.max(largest_coordinate(f1), largest_coordinate(f2))),
     )
-    # The exponent without the digits is a power of two. Points in one place give 0, hence no number and no proof.
-    scale = wp.float64(1.0) / wp.cast(wp.cast(size, wp.int64) & EXPONENT_BITS, wp.float64)
+    # Points in one place give 0, hence no number and no proof.
+    scale = wp.float64(1.0) / power_below(size)
     a = wp.matrix_from_rows(zero, e1 * scale, e2 * scale)
     b = wp.matrix_from_rows(f0 * scale, f1 * scale, f2 * scale)
     far = d * scale

@@ -31,7 +31,7 @@ longer than 4 L.
 import warp as wp
 
 from warp_abtree.kernels.exact.expansion import fuse_multiply
-from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, clamp_unit, divide, largest_coordinate
+from warp_abtree.kernels.triangle.distance import clamp_unit, divide, largest_coordinate, power_below
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -75,8 +75,8 @@ def scale_triangles(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: 
         wp.max(largest_coordinate(t.a1), largest_coordinate(t.a2)),
         wp.max(largest_coordinate(t.b0), wp.max(largest_coordinate(t.b1), largest_coordinate(t.b2))),
     )
-    # The exponent without the digits; 1 where all points are in one place.
-    power = wp.cast(wp.cast(size, wp.int64) & EXPONENT_BITS, wp.float64)
+    # 1 where all points are in one place.
+    power = power_below(size)
     t.size = wp.where(power > wp.float64(0.0), power, wp.float64(1.0))
     scale = wp.float64(1.0) / t.size
     t.a1 = t.a1 * scale

@@ -110,9 +110,11 @@ class Dynamics(RigidBodies):
                 old = getattr(self._warm_start, name)
                 wp.copy(getattr(warm_start, name).flatten(), old.flatten(), count=old.size)
         color, pair = (wp.zeros(2 * room, dtype=wp.int32, device=self.device) for _ in range(2))
+        shape = room if self.device.is_cpu else 0, POINTS_MAX  # where each lane does not hold a point
+        relaxed = wp.empty(shape, dtype=solve.RelaxedPoint, device=self.device)
         with self._changing():
             self.constraints, self._warm_start, self._room = constraints, warm_start, room
-            self._sorted_color, self._sorted_pair = color, pair
+            self._sorted_color, self._sorted_pair, self._relaxed = color, pair, relaxed
 
     @contextmanager
     def _changing(self):
@@ -274,7 +276,7 @@ class Dynamics(RigidBodies):
         if len(colors) > 1 and not self.device.is_cuda:
             warps = 1  # blocks of one thread know no barrier
         each.first_color, each.last_color, each.warps = colors[0], colors[-1], warps
-        arrays = [self._sorted_pair, self._color_start, self.query.pair_batch, self.query.manifolds]
+        arrays = [self._sorted_pair, self._color_start, self.query.pair_batch, self.query.manifolds, self._relaxed]
         block = WARP_SIZE * (warps if len(colors) > 1 else 1)
         threads = warps * (WARP_SIZE if self.device.is_cuda else 1)
         self._launch(solve.relax_kernel, threads, [each, *arrays, self.constraints, self.bodies], block)

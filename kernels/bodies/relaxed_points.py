@@ -1,0 +1,259 @@
+"""Points of a pair while they are relaxed: in float32, about what they were, in units of the pair.
+
+Springs and what they give up are those of a substep. Impulses act on both objects in float64: no momentum is lost.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.base.lanes import vector64_of_lane
+from warp_abtree.kernels.base.poses import HALF
+from warp_abtree.kernels.bodies.bodies import DYNAMIC, ONE, ZERO, Bodies
+from warp_abtree.kernels.bodies.constraints import SLOP, Constraints, velocity_at
+from warp_abtree.kernels.contacts.manifold import Manifolds
+from warp_abtree.kernels.triangle.distance import power_below
+
+wp.set_module_options(native.options("base/lanes.cuh"))
+
+_FREQUENCY = 1.0  # angle that a point's spring would swing by in a substep [rad]
+_RESPONSE = 2.0 * 10.0 + _FREQUENCY  # twice its damping ratio, and that
+RECOVERY = wp.constant(wp.float64(_FREQUENCY / _RESPONSE))
+"""Part of the penetration that its spring corrects in a substep."""
+
+SOFTNESS = wp.constant(wp.float64(1.0 / (1.0 + _FREQUENCY * _RESPONSE)))
+"""Part of the impulse that it gives up."""
+
+
+@wp.struct
+class Relaxation:
+    """Parameters of a pass."""
+
+    stage: wp.int32  # WARM_START, SOLVE or RELAX
+    backward: wp.int32  # 1 if it goes from the last pair to the first
+    first_color: wp.int32  # first color of the range
+    last_color: wp.int32  # last color of the range
+    warps: wp.int32  # warps of the launch; one block where there are several colors
+    friction: wp.float64  # coefficient of Coulomb's law
+    fast: wp.float64  # speed from which on points that meet strike [world units/s]; 0 without gravity
+    rest: wp.float64  # depth at which points rest, in slops
+    per_substep: wp.float64  # substeps a second
+    correction: wp.float64  # part of the penetration that is corrected a second, however deep [1/s]
+
+
+@wp.struct
+class Units:
+    """Powers of two that the points of a pair are relaxed in, in float32; impulses are sums in float64."""
+
+    length: wp.float64  # about the smaller bounding radius [world units]
+    per_length: wp.float64  # 1 over it
+    per_speed: wp.float64  # 1 over the speed of about a slop a substep [s/world units]
+    mass: wp.float64  # about that of the lighter object
+    impulse: wp.float64  # mass times speed
+
+
+@wp.struct
+class Side:
+    """What impulses move one object of a pair by, in the pair's units."""
+
+    inverse_mass: wp.float32  # 0 if it is not dynamic
+    inverse_inertia: wp.mat33  # world frame, 0 so too
+
+
+@wp.struct
+class Change:
+    """How much the motion of an object has changed in a pass, in the pair's units."""
+
+    velocity: wp.vec3  # of the centre of mass
+    turning: wp.vec3  # angular velocity, world frame
+
+
+@wp.struct
+class RelaxedPoint:
+    """A point of a pair while it is relaxed, in the pair's units."""
+
+    normal: wp.vec3  # from the first object to the second
+    arm_a: wp.vec3  # from the centre of mass of the first object to where its impulses act
+    arm_b: wp.vec3  # from that of the second
+    velocity: wp.vec3  # of the second object relative to the first where a pass begins
+    response: wp.vec3  # velocity that a unit impulse along the normal gives
+    mass: wp.float32  # impulse along the normal that a unit of speed along it takes
+    approach: wp.float32  # speed at which it may approach, below 0 if it is to separate
+    along: wp.float32  # impulse along the normal
+    across: wp.vec3  # across it, world frame
+    is_deep: wp.bool  # deeper than it rests
+    is_apart: wp.bool  # more than a slop from there: what is still to come near has no friction yet
+
+
+@wp.struct
+class PairImpulse:
+    """Sum of impulses of a pair's points."""
+
+    impulse: wp.vec3d  # on the second object; the first has its opposite
+    moment_a: wp.vec3d  # about the centre of mass of the first object
+    moment_b: wp.vec3d  # about that of the second
+
+
+@wp.func
+def dynamic_part(bodies: Bodies, i: wp.int32):
+    """Return the inverse mass of an object, 0 if impulses do not move it."""
+    return wp.where(bodies.motion_type[i] == DYNAMIC, bodies.inverse_mass[i], ZERO)
+
+
+@wp.func
+def make_units(per_substep: wp.float64, slop: wp.float64, pair: wp.vec2i, bodies: Bodies):
+    units = Units()
+    units.length = power_below(slop / SLOP)
+    units.per_length = ONE / units.length
+    speed = power_below(slop * per_substep)
+    units.per_speed = ONE / speed
+    units.mass = power_below(ONE / (dynamic_part(bodies, pair[0]) + dynamic_part(bodies, pair[1])))
+    units.impulse = units.mass * speed
+    return units
+
+
+@wp.func
+def load_side(units: Units, bodies: Bodies, i: wp.int32):
+    side = Side()
+    if bodies.motion_type[i] == DYNAMIC:
+        side.inverse_mass = wp.float32(bodies.inverse_mass[i] * units.mass)
+        inertia = bodies.inverse_inertia[i]
+        for j in range(3):
+            for k in range(3):
+                side.inverse_inertia[j, k] = wp.float32(inertia[j, k] * (units.mass * units.length * units.length))
+    return side
+
+
+@wp.func
+def push(side: Side, change: Change, impulse: wp.vec3, moment: wp.vec3):
+    """Return the change of an object's motion after an impulse, and its moment about the centre of mass."""
+    after = Change()
+    after.velocity = change.velocity + side.inverse_mass * impulse
+    after.turning = change.turning + side.inverse_inertia * moment
+    return after
+
+
+@wp.func
+def response_of(side: Side, arm: wp.vec3, impulse: wp.vec3):
+    """Return the velocity that an impulse gives an object where its arm ends."""
+    return side.inverse_mass * impulse + wp.cross(side.inverse_inertia * wp.cross(arm, impulse), arm)
+
+
+@wp.func
+def approach_of(relaxation: Relaxation, corrects: bool, slop: wp.float64, room: wp.float64):
+    """Return at what speed a point may approach [world units/s], below 0 if it is to separate.
+
+    Args:
+        corrects: Whether points that are too deep are to separate.
+        room: How far it may approach [world units], below 0 if it is too deep.
+    """
+    if room >= ZERO:
+        return relaxation.per_substep * room
+    if not corrects:
+        return ZERO
+    return wp.min(RECOVERY * relaxation.per_substep * wp.max(room, -slop), relaxation.correction * room)
+
+
+@wp.func
+def friction_of(a: Side, b: Side, point: RelaxedPoint, most: wp.float32, slide: wp.vec3):
+    """Return the friction impulse of a point that stops its tangential velocity `slide`, cut to `most`."""
+    if most <= 0.0:
+        return wp.vec3()
+    response = wp.dot(slide, response_of(a, point.arm_a, slide) + response_of(b, point.arm_b, slide))
+    wanted = wp.vec3(point.across)
+    if response > 0.0:
+        wanted -= (wp.dot(slide, slide) / response) * slide
+    square = wp.dot(wanted, wanted)
+    if square > most * most:
+        wanted = (most / wp.sqrt(square)) * wanted
+    return wanted
+
+
+@wp.func
+def load_point(
+    relaxation: Relaxation,
+    units: Units,
+    corrects: bool,
+    p: wp.int32,
+    k: wp.int32,
+    pair: wp.vec2i,
+    manifolds: Manifolds,
+    constraints: Constraints,
+    bodies: Bodies,
+):
+    """Return the k-th point of a pair, without its responses, and at what speed it approaches [world units/s].
+
+    Its impulses act in the middle of where both objects have taken it.
+    """
+    a, b, slop = pair[0], pair[1], constraints.slop[p]
+    n, first_a, first_b = manifolds.normal[p, k], constraints.arm_a[p, k], constraints.arm_b[p, k]
+    shift = bodies.moved[b] - bodies.moved[a]
+    arm_a, arm_b = first_a + HALF * shift, first_b - HALF * shift
+    moved = shift + wp.cross(bodies.turned[b], first_b) - wp.cross(bodies.turned[a], first_a)
+    room = relaxation.rest * slop - manifolds.depth[p, k] + wp.dot(n, moved)
+    velocity = velocity_at(bodies, b, arm_b) - velocity_at(bodies, a, arm_a)
+    point, per_impulse = RelaxedPoint(), ONE / units.impulse
+    point.normal = wp.vec3(n)
+    point.arm_a = wp.vec3(arm_a * units.per_length)
+    point.arm_b = wp.vec3(arm_b * units.per_length)
+    point.velocity = wp.vec3(velocity * units.per_speed)
+    point.approach = wp.float32(approach_of(relaxation, corrects, slop, room) * units.per_speed)
+    point.along = wp.float32(constraints.impulse[p, k] * per_impulse)
+    point.across = wp.vec3(constraints.friction_impulse[p, k] * per_impulse)
+    point.is_deep = room < ZERO
+    point.is_apart = room > slop
+    return point, -wp.dot(n, velocity)
+
+
+@wp.func
+def relax_point(
+    point: wp.ref[RelaxedPoint],
+    a: Side,
+    b: Side,
+    change_a: Change,
+    change_b: Change,
+    softens: bool,
+    friction: wp.float32,
+):
+    """Relax a point, and return its impulse and the part along the normal."""
+    n, before = wp.vec3(point.normal), wp.float32(point.along)
+    at_a = change_a.velocity + wp.cross(change_a.turning, point.arm_a)
+    velocity = point.velocity + (change_b.velocity + wp.cross(change_b.turning, point.arm_b) - at_a)
+    excess = wp.dot(n, velocity) + point.approach
+    soft = wp.where(softens and point.is_deep, wp.float32(SOFTNESS), 0.0)
+    after = wp.max((1.0 - soft) * (before - point.mass * excess), 0.0)
+    more = after - before
+    velocity += more * point.response
+    most = wp.where(point.is_apart, 0.0, friction * after)
+    wanted = friction_of(a, b, point, most, velocity - wp.dot(n, velocity) * n)
+    impulse = more * n + (wanted - point.across)
+    point.along = after
+    point.across = wanted
+    return impulse, more
+
+
+@wp.func
+def act_at_point(p: wp.int32, k: wp.int32, half: wp.vec3d, impulse: wp.vec3d, constraints: Constraints):
+    """Return an impulse at the k-th point of a pair with its moments.
+
+    Args:
+        half: Half of how far the second object has moved more than the first.
+    """
+    of_point = PairImpulse()
+    of_point.impulse = impulse
+    of_point.moment_a = wp.cross(constraints.arm_a[p, k] + half, impulse)
+    of_point.moment_b = wp.cross(constraints.arm_b[p, k] - half, impulse)
+    return of_point
+
+
+@wp.func
+def add_of_lanes(total: PairImpulse, own: PairImpulse, count: wp.int32):
+    """Return a sum with what the first lanes have, in their order."""
+    more = PairImpulse()
+    more.impulse = total.impulse
+    more.moment_a = total.moment_a
+    more.moment_b = total.moment_b
+    for lane in range(count):
+        more.impulse += vector64_of_lane(own.impulse, lane)
+        more.moment_a += vector64_of_lane(own.moment_a, lane)
+        more.moment_b += vector64_of_lane(own.moment_b, lane)
+    return more
