@@ -35,6 +35,7 @@ CORRECTION = 0.2  # part of the penetration that a step corrects, however deep
 COLOR_ROUNDS = int(COLOR_COUNT)  # of the graph coloring
 LAST_COLORS = 10  # first of the last colors, which one block relaxes
 TAIL_WARPS = 8  # of that block
+RELAXING_WARPS = 8  # of a processor, which relax the pairs of another color
 
 
 class Dynamics(RigidBodies):
@@ -90,8 +91,9 @@ class Dynamics(RigidBodies):
             self.certified = CertifiedMotions(scene, self.bodies, Buffers(pairs=check_capacity(capacity).pairs))
         radii = self.bodies.bounding_radius.numpy()[self.rigid]
         self._least_slop = float(constraint_kernels.SLOP) * radii.min(initial=np.inf)
-        # No body is in two pairs of a color.
-        self._color_room = max(1, int(np.count_nonzero(self.rigid)))
+        # No body is in two pairs of a color; more warps than run at a time would wait.
+        warps = RELAXING_WARPS * self.device.sm_count if self.device.is_cuda else len(self.rigid)
+        self._color_warps = max(1, min(warps, int(np.count_nonzero(self.rigid))))
         self._warm_start = constraint_kernels.WarmStart()
         self._color_start = wp.empty(int(COLOR_COUNT) + 2, dtype=wp.int32, device=self.device)
         self._room, self._interrupted = -1, False
@@ -267,7 +269,7 @@ class Dynamics(RigidBodies):
         if not self._by_color:
             self._relax_colors(each, range(COLOR_COUNT + 1), 1)
             return
-        parts: list[tuple] = [([color], self._color_room) for color in range(LAST_COLORS)]
+        parts: list[tuple] = [([color], self._color_warps) for color in range(LAST_COLORS)]
         parts.append((range(LAST_COLORS, COLOR_COUNT + 1), TAIL_WARPS))
         for colors, warps in reversed(parts) if each.backward else parts:
             self._relax_colors(each, colors, warps)
