@@ -154,6 +154,7 @@ def test_other_contacts_come_first(device):
     found.collide(state, other)
     assert found.others.rigid_contact_max == 99
     assert ab.NewtonContacts(model, models={1: own}).scene.models[0] is own
+    refused(ValueError, "models: 3 is no index of a mesh", ab.NewtonContacts, model, models={1: own, 3: own})
 
 
 @pytest.mark.slow

@@ -234,6 +234,20 @@ def test_small_bodies_and_long_steps_have_more_substeps(device):
         assert np.abs(moved[:, :2]).max() < 1e-3 and -0.02 < moved[:, 2].min() <= moved[:, 2].max() < 0
 
 
+def test_powers_of_two_scale_every_bit_of_a_heap(device):
+    """Points are relaxed in float32, in units of their pair: scenes of any size keep as many digits."""
+    found = []
+    for scale in (1.0, 2.0**-40, 2.0**60):
+        parts = [model_of(trimesh.creation.box((e, e, 1.0)).apply_scale(scale)) for e in (20, 1)]
+        turns = [about((1, 2, 3), angle) for angle in (0.0, 0.2, 0.9, 2.0)]
+        placed = [(parts[k > 0], (0.2 * k * scale, 0, (1.2 * k - 0.5) * scale, *turns[k]), k == 0) for k in range(4)]
+        dynamics = make(device, *placed, gravity=(0, 0, -10 * scale))
+        for _ in range(40):
+            dynamics.step(1 / 64)
+        found.append((dynamics.poses() / np.repeat([scale, 1.0], (3, 4))).tobytes())
+    assert found[0] == found[1] == found[2]
+
+
 def test_a_heavy_cube_stands_on_a_light_one(device):
     dynamics = on_ground(device, (CUBE, (0, 0, 0.5, 0, 0, 0, 1)), (box(4, 4, 4), (0, 0, 3, 0, 0, 0, 1)))
     run(dynamics, 240, 1 / 60)

@@ -139,8 +139,8 @@ class NewtonContacts(DeviceMemory):
 
     Raises:
         ImportError: Newton is not installed.
-        ValueError: Fewer than two mesh shapes; a mesh whose surface moves (`enable_surface_velocity`); or a solid that
-            is no index of a mesh shape.
+        ValueError: Fewer than two mesh shapes; a mesh whose surface moves (`enable_surface_velocity`); or a solid or a
+            key of `models` that is no index of a mesh shape.
         MeshError: A solid whose mesh is not closed; the message names edges.
     """
 
@@ -163,7 +163,9 @@ class NewtonContacts(DeviceMemory):
         still = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(found), 1))
         static, world = model.shape_body.numpy()[found] < 0, model.shape_world.numpy()[found]
         inside = _find_solids(found, solids)
-        self.scene.add_many(self._find_models(found, models or {}), still, worlds=world, statics=static, solids=inside)
+        self.scene.add_many(
+            self._find_models(found.tolist(), models or {}), still, worlds=world, statics=static, solids=inside
+        )
         self.scene.filter(_excluded_pairs(model, self.shapes))
         self._pairs_of_others = _other_pairs(model, is_mesh, collide)
         self._has_others = len(self._pairs_of_others) > 0 or model.particle_count > 0
@@ -191,7 +193,10 @@ class NewtonContacts(DeviceMemory):
     def _find_models(self, shapes, given):
         """Return the model of each shape; shapes of one mesh and scale share theirs."""
         known, scale, models = {}, self.model.shape_scale.numpy(), []
-        for shape in shapes.tolist():
+        for shape in given:
+            if shape not in shapes:
+                raise ValueError(f"models: {shape!r} is no index of a mesh shape that collides; these are {shapes}")
+        for shape in shapes:
             source = self.model.shape_source[shape]
             if getattr(source, "enable_surface_velocity", False):
                 raise ValueError(f"the surface of shape {shape} moves (enable_surface_velocity): not supported")

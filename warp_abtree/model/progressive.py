@@ -127,13 +127,21 @@ class ProgressiveMesh:
         if (fraction is None) == (tolerance is None):
             raise ValueError("lod_for takes exactly one of fraction= and tolerance=")
         if tolerance is not None:
-            if not (isinstance(tolerance, Real) and float(tolerance) >= 0):
+            if not _as_float(tolerance) >= 0:
                 raise ValueError(f"tolerance must be >= 0, got {tolerance!r}")
             return int(np.argmax(self.lod_error <= tolerance))
-        if not (isinstance(fraction, Real) and 0 < float(fraction) <= 1):
+        if not 0 < _as_float(fraction) <= 1:
             raise ValueError(f"fraction must lie in (0, 1], got {fraction!r}")
         miss = np.abs(self._active_counts - fraction * self.face_count)
         return int(self.lod_max - np.argmin(miss[::-1]))
+
+
+def _as_float(value) -> float:
+    """Return a real number as float, NaN for what is none or has none."""
+    try:
+        return float(value) if isinstance(value, Real) else np.nan
+    except OverflowError:
+        return np.nan
 
 
 def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None, certify=False):
