@@ -154,9 +154,10 @@ class RigidBodies(DeviceMemory):
         turn = FIRST_STEP * np.linalg.norm(angular_velocity, axis=1) * radius
         most = float(kernels.LOOKAHEAD_MAX) * radius
         motion = FIRST_STEP * np.where(self.rigid[:, None], velocity, 0.0)
-        length = np.maximum(np.linalg.norm(motion, axis=1), 1e-300)
+        length = np.linalg.norm(motion, axis=1)
+        part = np.minimum(most, length) / np.maximum(length, 1e-300)
         reach = np.minimum(turn, most) + float(kernels.LOOKAHEAD_LEAST) * radius
-        return np.column_stack([motion * np.minimum(most / length, 1.0)[:, None], reach])
+        return np.column_stack([motion * part[:, None], reach])
 
     def clear_targets(self):
         """Let kinematic objects stand where they are."""
