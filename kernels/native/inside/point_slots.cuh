@@ -7,7 +7,7 @@
 
 struct PointSlots {
     double x[3][WARP_SIZE], least[WARP_SIZE];
-    float below[3][WARP_SIZE], above[3][WARP_SIZE];  // the point in the frame of the boxes, rounded both ways
+    float below[3][WARP_SIZE], above[3][WARP_SIZE];  // the point as boxes see it, rounded both ways, on CUDA alone
     int face[WARP_SIZE];
 };
 
@@ -27,8 +27,6 @@ inline CUDA_CALLABLE void put_point(wp::int32 slot, wp::vec3d point, wp::vec3d x
 #if defined(__CUDA_ARCH__)
         slots.below[i][slot] = __double2float_rd(x[i]);
         slots.above[i][slot] = __double2float_ru(x[i]);
-#else
-        slots.below[i][slot] = slots.above[i][slot] = (float)x[i];
 #endif
     }
     slots.least[slot] = most;
