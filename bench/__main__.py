@@ -36,7 +36,7 @@ MODULES |= {
 MODULES |= {"robot": "bench.motions.robot", "gate": "bench.gate.compare"}
 MODULES |= {name: f"bench.studies.{module}" for name, module in STUDIES.items()}
 FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml
-# A case, and a study, takes the options that its function `run` has as arguments.
+# A case, and a study, takes the options that its function `run` has as arguments; a case a `wp.Device` before them.
 OPTIONS = {
     "quick": {"action": "store_true", "default": None, "help": "the smallest sizes, to try a case out"},
     "models": {"metavar": "DIR", "help": "keep the models there"},
@@ -80,8 +80,9 @@ def main(argv=None):
         return 0
     wp.config.log_level = wp.LOG_WARNING
     rows = []
-    for row in case.run(options.device, **asked):
-        rows.append({key: tables.plain(value) for key, value in row.items()})
+    device = wp.get_device(options.device)
+    for row in case.run(device, **asked):
+        rows.append({key: tables.plain(value) for key, value in ({"device": device.name} | row).items()})
         print("  ".join(f"{key}={value}" for key, value in rows[-1].items()), flush=True)
     if options.json:
         Path(options.json).write_text(json.dumps({**describe_run(), "rows": rows}, indent=1), encoding="utf-8")

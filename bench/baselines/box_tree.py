@@ -54,7 +54,7 @@ def run(device, quick=False):
 
     On a GPU both are graphs. The pairs of both are compared.
     """
-    device, box = wp.get_device(device), ab.Model.load(trimesh.creation.box((1, 1, 1)))
+    box = ab.Model.load(trimesh.creation.box((1, 1, 1)))
     for count, worlds in QUICK if quick else FULL:
         rng, each = np.random.default_rng(0), count // worlds
         places = rng.uniform(0, SPACING * each ** (1 / 3), (count, 3))
@@ -73,5 +73,5 @@ def run(device, quick=False):
         times = time_rounds(
             make_runs({"ours": ours.launch, "peer": tree.launch}, device), REPEATS["cuda" if device.is_cuda else "cpu"]
         )
-        row = {"device": device.name, "objects": count, "worlds": worlds, "pairs": len(pairs)}
+        row = {"objects": count, "worlds": worlds, "pairs": len(pairs)}
         yield row | summarise(times) | {"ratio": ratio_of(times["peer"], times["ours"])}

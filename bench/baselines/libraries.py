@@ -9,7 +9,6 @@ exact oracle of the tests. Libraries that are not installed (extra `peers`) are 
 import time
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 
@@ -33,13 +32,13 @@ QUESTIONS = ("any", "faces", "distances")
 
 def run(device, quick=False):
     """Yield a row a workload and library: times [us a pose], and its answers that are not ours."""
-    device, sizes = wp.get_device(device), QUICK if quick else FULL
+    sizes = QUICK if quick else FULL
     knots = ab.Model.from_arrays(*knot(300 if quick else 5000), name="knot")
     workloads = {"knot": (knots, knots), **({} if quick else real_meshes(REAL))}
     for name, models in workloads.items():
         with one_core() as core:
             for row in measure(models, device, **sizes):
-                yield {"device": device.name, "workload": name, "core": core} | row
+                yield {"workload": name, "core": core} | row
 
 
 def measure(models, device, poses, repeats, judged):

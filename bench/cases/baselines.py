@@ -7,7 +7,6 @@ them.
 """
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 
@@ -30,13 +29,12 @@ BASELINES = (Fcl, Trimesh)
 def run(device, quick=False):
     """Yield one row a workload and baseline (column peer): differences, queries a second of both, and ratios (ours over
     the peer)."""
-    device = wp.get_device(device)
     sizes = QUICK if quick else FULL
     knots = ab.Model.from_arrays(*knot(sizes["faces"]), name="knot")
     for name, models in {"knot-knot": (knots, knots), **real_meshes(REAL)}.items():
         with one_core() as core:
             for row in measure(models, device, sizes["poses"], sizes["repeats"]):
-                yield {"device": device.name, "workload": name, "core": core} | row
+                yield {"workload": name, "core": core} | row
 
 
 def random_matrices(rng, model_a, model_b, count):

@@ -38,7 +38,6 @@ def run(device, count=None, quick=False):
     truth, fractions left to float64 and to exact signs, error rate of float32 alone, time a pair [ns]; then one a
     scene of meshes. Raise a RuntimeError where an answer was wrong, or the tests' oracle is not at hand.
     """
-    device = wp.get_device(device)
     if load_oracle() is None:
         raise RuntimeError("the exact oracle is not at hand; run this in a checkout with its tests")
     one = make_chunk(("random", 0, 1))
@@ -51,7 +50,7 @@ def run(device, count=None, quick=False):
         for kind, group in itertools.groupby(chunks, key=lambda chunk: chunk[0][0]):
             tally = sum(check_chunk(job, truth, device) for job, truth in group)
             wrong += tally[2]
-            yield describe_tally(device, kind, tally)
+            yield describe_tally(kind, tally)
     if wrong:
         raise RuntimeError("exact signs gave a wrong answer")
     yield from measure_meshes(device, QUICK if quick else FULL)
@@ -71,7 +70,7 @@ def measure_meshes(device, sizes):
         times = time_in_turn({p: query.launch for p, query in queries.items()}, device, sizes["repeats"])
         exact = found["exact"]
         tests = exact.triangle_tests.sum()
-        row = {"device": device.name, "scene": name, "hits": len(exact.faces), "triangle_tests": tests}
+        row = {"scene": name, "hits": len(exact.faces), "triangle_tests": tests}
         row |= {"to_float64": exact.float64_tests.sum() / tests, "to_exact": exact.exact_tests.sum() / tests}
         row["float32_missed"], row["float32_invented"] = count_differences(found["float32"].faces, exact.faces)
         row |= summarise(times)
@@ -197,10 +196,10 @@ def check_chunk(job, truth, device):
     return np.array([*counts, single_time, double_time, exact_time, unproven_time + rest_time], float)
 
 
-def describe_tally(device, kind, tally):
+def describe_tally(kind, tally):
     """Turn a tally into a row."""
     pairs, hits, wrong, to_float64, to_exact, unproven, *times = tally.tolist()
     shares = {"meet": hits, "to_float64": to_float64, "to_exact": to_exact, "float32_errors": unproven}
-    row = {"device": device.name, "kind": kind, "pairs": int(pairs), "disagreements": int(wrong)}
+    row = {"kind": kind, "pairs": int(pairs), "disagreements": int(wrong)}
     row |= {name: count / pairs for name, count in shares.items()}
     return row | {name: 1e9 * t / pairs for name, t in zip(STAGES, times, strict=True)}

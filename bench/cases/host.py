@@ -1,9 +1,6 @@
 """Time to read results: `Scene.intersect` beside its launches, by output and size."""
 
-import gc
-
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 
@@ -26,14 +23,12 @@ def run(device, quick=False):
     for, with what the result says of each pair; goal_ms is launches and their transfer at 20 GB/s, ratio intersect over
     it.
     """
-    device = wp.get_device(device)
     sizes = QUICK if quick else KNOT_PAIRS
     model = ab.Model.from_arrays(*knot(sizes["faces"]), name="knot")
     for count, distance in knot_batches(device, sizes):
-        gc.collect()
         scene, pairs = scene_of_pairs(device, model, pair_poses(count, distance))
         for output in OUTPUTS:
-            row = {"device": device.name, "pairs": count, "distance": distance, "output": output}
+            row = {"pairs": count, "distance": distance, "output": output}
             yield row | time_output(device, scene, pairs, output, sizes["repeats"])
 
 

@@ -1,10 +1,8 @@
 """All intersecting face pairs of many posed pairs of one knot, beside wp.Bvh and Newton, where installed."""
 
-import gc
 import time
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 
@@ -28,7 +26,6 @@ def run(device, quick=False):
     says how many face pairs on which the peer differs the exact oracle decided, ours_wrong in how many it sides with
     the peer. Memory is that of scene and query, before the baselines.
     """
-    device = wp.get_device(device)
     sizes = QUICK if quick else KNOT_PAIRS
     mesh = knot(sizes["faces"])
     model = ab.Model.from_arrays(*mesh, name=f"knot {len(mesh[1]):,}")
@@ -39,7 +36,6 @@ def run(device, quick=False):
 
 def run_batch(device, model, mesh, poses, repeats):
     """Return the row of one batch of pairs."""
-    gc.collect()  # scenes and their queries hold each other
     scene, pairs = scene_of_pairs(device, model, poses)
     begin = time.perf_counter()
     whole = scene.intersect(pairs, output="faces")
@@ -47,7 +43,7 @@ def run_batch(device, model, mesh, poses, repeats):
     query = ab.Query(scene, output="faces", pairs=pairs, capacity=max(1, len(whole.faces)))
     memory = memory_columns(scene, query)
     baseline = BvhPosed(*mesh, poses, 4 * len(whole.faces) + 1024, device)
-    row = {"device": device.name, "faces": len(mesh[1]), "pairs": len(pairs), "hits": len(whole.faces)}
+    row = {"faces": len(mesh[1]), "pairs": len(pairs), "hits": len(whole.faces)}
     row |= {name: getattr(whole, name).sum(dtype=np.int64) for name in COUNTERS}
     row |= {"first_s": first, "peer": f"wp.Bvh {baseline.constructor}"}
     newton, skipped = {}, {"newton": "more pairs take minutes"}

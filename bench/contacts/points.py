@@ -9,7 +9,6 @@ on one core, in turn with the face pairs of that world.
 import time
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 
@@ -35,7 +34,6 @@ def run(device, quick=False, count=None, models=None):
     the like are penetration; worlds_ms is a launch over all worlds, one_ms over the first, faces_ms is
     `Query(scene, "faces")` of it and one_ratio one_ms over that.
     """
-    device = wp.get_device(device)
     sizes, folder = QUICK if quick else FULL, ModelFolder(models)
     missing = [name for name in NUT if not folder.has(name)]
     if missing:
@@ -52,7 +50,7 @@ def run(device, quick=False, count=None, models=None):
         scene.set_lods([lods[0]] + [lods[1]] * len(judged))
         near = scene.intersect(pairs, output="contacts", gap=GAP)
         for asked in ASKED:
-            row = {"device": device.name, "case": name, "faces": faces, "poses": len(judged)}
+            row = {"case": name, "faces": faces, "poses": len(judged)}
             found = ab.ManifoldQuery(scene, pairs, gap=GAP, points=asked).run()
             row |= judge(near, found) | {"asked": asked, "worlds": count}
             yield row | time_worlds(device, parts, lods, placed, asked, found, sizes["repeats"])

@@ -11,7 +11,6 @@ import time
 from collections import Counter
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 from warp_abtree import testing
@@ -34,7 +33,6 @@ NUT = ("factory-bolt-m20", "factory-nut-m20")
 
 def run(device, count=None, quick=False):
     """Yield the rows; count is that of the checked motions."""
-    device = wp.get_device(device)
     sizes = dict(QUICK if quick else CPU if device.is_cpu else FULL)
     sizes["checked"] = count or sizes["checked"]
     yield check_queries(device, tight_inclusion.AVAILABLE and device.is_cpu and not quick)
@@ -91,7 +89,7 @@ def check_queries(device, baseline):
     if not counts["asked"]:
         return {"case": "queries", "skipped": "no files: set ABTREE_CCD to their folder"}
     taken = {name: 1e6 * value / counts["asked"] for name, value in seconds.items()}
-    return {"device": device.name, "case": "queries"} | counts | taken
+    return {"case": "queries"} | counts | taken
 
 
 def between(first, last, times):
@@ -118,7 +116,7 @@ def check_motions(name, model, device, sizes):
     touching = ~rows["clear"] & ~rows["undecided"] & (rows["time"] > 0)
     later = np.minimum(rows["time"] + TOLERANCE, 1)
     meets = ab.sweep(model, model, between(first, last, later), device=device)
-    row = {"device": device.name, "case": f"checked, {name}", "asked": len(rows), "clear": rows["clear"].sum()}
+    row = {"case": f"checked, {name}", "asked": len(rows), "clear": rows["clear"].sum()}
     row |= {"at_start": (rows["time"] == 0).sum(), "undecided": rows["undecided"].sum()}
     return row | {"late": late, "missed": missed, "early": (touching & ~meets).sum()}
 
@@ -129,7 +127,7 @@ def measure(name, models, poses, device, sizes):
     scene, pairs = scene_of_poses(device, *models, first)
     query = ab.FirstContactQuery(scene, np.concatenate([np.eye(4)[None], last]), pairs, tolerance=TOLERANCE)
     found = query.run()
-    row = {"device": device.name, "case": name, "motions": len(pairs)}
+    row = {"case": name, "motions": len(pairs)}
     row |= {"clear": found.clear.sum(), "at_start": (found.time == 0).sum(), "undecided": found.undecided.sum()}
     row |= {"node_tests": found.node_tests.mean(), "face_tests": found.triangle_tests.mean()}
     with one_core(), no_garbage_collection():

@@ -46,6 +46,6 @@ def measure(worlds, device, steps=STEPS):
         last = poses
         off = np.maximum(off, np.abs(poses[:, 2] - start[:, 2] - PITCH * turned / (2 * np.pi)))
     meet = scene.intersect(scene.broad_phase(), output="any").any
-    row = {"device": wp.get_device(device).name, "nuts": len(nuts), "steps": len(times)}
+    row = {"nuts": len(nuts), "steps": len(times)}
     row |= {"tunnelled": (off > PITCH / 2).sum(), "off_max": off.max(), "pitch": PITCH}
     return row | {"meet_at_end": meet.sum(), "step_ms": np.median(times), "step_max_ms": max(times)}

@@ -6,13 +6,11 @@ our own. Around it stand real meshes, joined to one of about 190,000 faces; with
 
 import os
 import tempfile
-import time
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import trimesh
-import warp as wp
 
 import warp_abtree as ab
 from warp_abtree.model.mesh import load_mesh
@@ -20,7 +18,7 @@ from warp_abtree.model.mesh import load_mesh
 from ..baselines.fcl import FclRobot
 from ..meshes import mesh_file
 from ..shapes import knot
-from ..timing import one_core, summarise, time_call, time_rounds
+from ..timing import host_clock, one_core, summarise, time_call, time_rounds
 
 FULL = {"count": 4096, "fcl": 512, "repeats": 7, "fine": 70}
 QUICK = {"count": 24, "fcl": 24, "repeats": 1, "fine": 12}
@@ -75,7 +73,7 @@ def run(device, quick=False, only=PARTS):
     On the CPU one thread works. Forward kinematics is part of our time, and none of python-fcl's, which asks pair by
     pair until two intersect. Answers that differ from its are counted.
     """
-    device, sizes = wp.get_device(device), QUICK if quick else FULL
+    sizes = QUICK if quick else FULL
     with tempfile.TemporaryDirectory() as folder:
         path = os.environ.get("ABTREE_ROBOT") or write_arm(Path(folder), sizes["fine"])
         robot = ab.Robot.load(path, "visual", device, mounted=["link0"])
@@ -83,10 +81,9 @@ def run(device, quick=False, only=PARTS):
     around = ab.Model.load(mesh, base_faces=len(mesh.faces))
     count, rng = sizes["count"] if device.is_cpu else 2**20, np.random.default_rng(0)
     configurations = rng.uniform(*robot.limits.T, (count, len(robot.joint_names)))
-    about = {"device": device.name, "robot_faces": sum(model.face_count for model in robot.models)}
+    about = {"robot_faces": sum(model.face_count for model in robot.models)}
     about |= {"world_faces": around.face_count, "self_pairs": len(robot.pairs)}
-    # One thread works: its own time leaves out other processes.
-    clock = time.thread_time if device.is_cpu else time.perf_counter
+    clock = host_clock(device)
     with one_core():
         if "any" in only:
             yield about | run_any(device, clock, robot, around, configurations, sizes)
