@@ -54,11 +54,12 @@ def pair_poses(pair_count, distance, seed=0):
 
 
 def knot_batches(device, sizes):
-    """Yield numbers of pairs, and distances of their centres, that do not take long on a device."""
+    """Yield batches of pairs of a knot that do not take long on a device: columns, the model, and poses (2 P, 7)."""
+    model = ab.Model.from_arrays(*knot(sizes["faces"]), name="knot")
     for count in sizes["pairs"]:
         for distance in sizes["distances"]:
             if count <= (PAIRS_MAX_CPU if device.is_cpu else PAIRS_MAX_CLOSE if distance < FAR else count):
-                yield count, distance
+                yield {"pairs": count, "distance": distance}, model, pair_poses(count, distance)
 
 
 def random_poses(reach, *shape, seed=0):

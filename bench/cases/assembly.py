@@ -16,7 +16,7 @@ import warp_abtree as ab
 
 from ..baselines import newton_nuts
 from ..baselines.fcl import Fcl
-from ..meshes import ModelFolder
+from ..meshes import NUT, ModelFolder
 from ..motions import hammered
 from ..shapes import centre_and_radius, scene_of_poses
 from ..timing import medians, one_core, ratio_of, time_on_host, to_host
@@ -131,10 +131,10 @@ def place_gears(models, count):
 
 
 CASES = (
-    ("nut on bolt", ("factory-bolt-m20", "factory-nut-m20"), place_nut),
+    ("nut on bolt", NUT, place_nut),
     ("peg in hole", ("factory-hole-8mm", "factory-peg-8mm"), place_peg),
     ("gears", ("factory-gear-medium", "factory-gear-small"), place_gears),
-    ("newton", ("factory-bolt-m20", "factory-nut-m20"), None),
+    ("newton", NUT, None),
 )
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import warp_abtree as ab
 
 from ..baselines.wp_bvh import BvhPosed
-from ..shapes import KNOT_PAIRS, knot, knot_batches, pair_poses, scene_of_pairs
+from ..shapes import KNOT_PAIRS, knot_batches, scene_of_pairs
 from ..timing import ratio_of, summarise, time_in_turn
 
 QUICK = {"faces": 300, "pairs": (2,), "distances": (0.2,), "repeats": 3}
@@ -19,12 +19,9 @@ def run(device, quick=False):
     hit_ns is the time of all face pairs for each that is found.
     """
     sizes = QUICK if quick else KNOT_PAIRS
-    model = ab.Model.from_arrays(*knot(sizes["faces"]))
-    for pair_count, distance in knot_batches(device, sizes):
+    for about, model, poses in knot_batches(device, sizes):
         for fraction in FRACTIONS:
-            row = {"pairs": pair_count, "distance": distance, "fraction": fraction}
-            poses = pair_poses(pair_count, distance)
-            yield row | run_batch(device, model, fraction, poses, sizes["repeats"])
+            yield about | {"fraction": fraction} | run_batch(device, model, fraction, poses, sizes["repeats"])
 
 
 def run_batch(device, model, fraction, poses, repeats):

@@ -22,7 +22,7 @@ import warp_abtree as ab
 
 from .. import shapes, timing
 from ..baselines.fcl import Fcl
-from ..meshes import ModelFolder, knot_model, mesh_file
+from ..meshes import NUT, ModelFolder, knot_model, mesh_file
 from .assembly import place_nut
 
 FULL = {"poses": 32, "counts": (1, 1024, 65536), "knot": 5000, "repeats": 7}
@@ -34,7 +34,6 @@ GAP_QUICK = {"faces": 300, "pairs": (4,), "distances": (0.2,), "repeats": 2}
 GAPS = 0.0, 1e-4, 3e-4, 1e-3, 3e-3  # of the mesh's size
 PARTS = ("nearest", "points", "gap")
 MESHES = ("cow", "rocker-arm", "stanford-bunny")
-NUT = ("factory-bolt-m20", "factory-nut-m20")
 
 
 def run(device, quick=False, only=PARTS):
@@ -56,9 +55,9 @@ def run(device, quick=False, only=PARTS):
         yield measure_points("torus", torus, device, 300 if quick else POINTS, True)
     if "gap" in only:
         sizes = GAP_QUICK if quick else GAP_FULL
-        knots = knot_model(sizes["faces"])
-        for count, distance in shapes.knot_batches(device, sizes):
-            yield from time_gaps(device, knots, count, distance, sizes["repeats"])
+        for about, model, poses in shapes.knot_batches(device, sizes):
+            for row in time_gaps(device, model, poses, sizes["repeats"]):
+                yield about | row
 
 
 def measure_all(device, quick):
@@ -174,9 +173,9 @@ def make_fcl(models, matrices, found, row):
     return fcl
 
 
-def time_gaps(device, model, count, distance, repeats):
+def time_gaps(device, model, poses, repeats):
     """Yield the rows of one batch; raise a RuntimeError where what intersects is not the same with a gap."""
-    scene, pairs = shapes.scene_of_pairs(device, model, shapes.pair_poses(count, distance))
+    scene, pairs = shapes.scene_of_pairs(device, model, poses)
     plain = scene.intersect(pairs, output="contacts")
     queries, found = {}, {}
     for gap in (None, *GAPS):
@@ -193,6 +192,6 @@ def time_gaps(device, model, count, distance, repeats):
         times = timing.time_in_turn(launches, device, repeats, timing.host_clock(device))
     middle = timing.medians(times)
     for gap in GAPS:
-        row = {"pairs": count, "distance": distance, "gap": gap, "contacts": found[gap]}
+        row = {"gap": gap, "contacts": found[gap]}
         row |= {"more": found[gap] / max(1, found[None]), "without_ms": middle[None], "with_ms": middle[gap]}
         yield row | {"ratio": timing.ratio_of(times[gap], times[None]), "meet": np.count_nonzero(plain.any)}

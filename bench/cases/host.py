@@ -4,7 +4,7 @@ import numpy as np
 
 import warp_abtree as ab
 
-from ..shapes import KNOT_PAIRS, knot, knot_batches, pair_poses, scene_of_pairs
+from ..shapes import KNOT_PAIRS, knot_batches, scene_of_pairs
 from ..timing import make_runs, medians, time_call, time_rounds
 
 QUICK = {"faces": 300, "pairs": (1, 4), "distances": (0.2,), "repeats": 2}
@@ -24,12 +24,10 @@ def run(device, quick=False):
     it.
     """
     sizes = QUICK if quick else KNOT_PAIRS
-    model = ab.Model.from_arrays(*knot(sizes["faces"]), name="knot")
-    for count, distance in knot_batches(device, sizes):
-        scene, pairs = scene_of_pairs(device, model, pair_poses(count, distance))
+    for about, model, poses in knot_batches(device, sizes):
+        scene, pairs = scene_of_pairs(device, model, poses)
         for output in OUTPUTS:
-            row = {"pairs": count, "distance": distance, "output": output}
-            yield row | time_output(device, scene, pairs, output, sizes["repeats"])
+            yield about | {"output": output} | time_output(device, scene, pairs, output, sizes["repeats"])
 
 
 def time_output(device, scene, pairs, output, repeats):

@@ -13,12 +13,11 @@ import numpy as np
 import warp_abtree as ab
 
 from ..cases.assembly import rest_nuts
-from ..meshes import ModelFolder
+from ..meshes import NUT, ModelFolder
 from ..shapes import scene_of_poses
 from ..timing import make_runs, medians, one_core, ratio_of, time_in_turn, time_rounds
 from .penetration import Contacts, near_contacts, penetration_allowed
 
-NUT = ("factory-bolt-m20", "factory-nut-m20")
 FULL = {"poses": 8, "worlds": {"cuda": 1024, "cpu": 8}, "repeats": 5}
 QUICK = {"poses": 2, "worlds": {"cuda": 2, "cpu": 2}, "repeats": 1}
 LODS = {"all faces": None, "10 um": 1e-5, "30 um": 3e-5}  # tolerance [m]
