@@ -36,11 +36,12 @@ def read_layout(name) -> dict:
     """Return the tables and figures of a TOML file of this folder.
 
     A table's part is by default that of its name; a column [name, heading, format], or its name alone, has by default
-    commas between thousands.
+    commas between thousands. What a figure does not say is taken from [figures].
     """
     layout = tomllib.loads((HERE / name).read_text(encoding="utf-8"))
     for table in layout.get("table", {}).values():
         table["columns"] = [[each, each] if isinstance(each, str) else each for each in table["columns"]]
+    layout["figure"] = [layout.get("figures", {}) | figure for figure in layout.get("figure", [])]
     return layout | {"table": [{"name": key, "part": key} | table for key, table in layout.get("table", {}).items()]}
 
 

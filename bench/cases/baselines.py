@@ -14,7 +14,7 @@ from ..baselines.fcl import Fcl, Trimesh
 from ..meshes import real_meshes
 from ..shapes import centre_and_radius, knot, pose_matrices, random_directions, scene_of_poses
 from ..timing import one_core, ratio_of, summarise, time_on_host, to_host
-from ..verify import judge_disputed
+from ..verify import count_differences, judge_disputed
 
 REAL = {
     "cow-cow": ("cow", "cow"),
@@ -108,12 +108,10 @@ def compare(made, answers, meshes, matrices, judged) -> dict:
     row = {"any_missed": (met & ~answer).sum(), "any_invented": (answer & ~met).sum()}
     one, far = made["faces"], made.get("distances")
     if hasattr(one, "faces"):
-        ours = {tuple(entry) for entry in answers["faces"].faces.tolist()}
-        theirs = {(pose, *pair) for pose, found in enumerate(one.faces()) for pair in one.face_pairs(found)}
-        wrong = judge_disputed(
-            list(theirs), list(ours), meshes, lambda pose: (np.eye(4), matrices[pose]), one.name, judged
-        )
-        row |= {"faces_missed": len(ours - theirs), "faces_invented": len(theirs - ours)}
+        ours, poses = answers["faces"].faces, [(np.eye(4), matrix) for matrix in matrices]
+        theirs = list({(pose, *pair) for pose, found in enumerate(one.faces()) for pair in one.face_pairs(found)})
+        wrong = judge_disputed(theirs, ours, meshes, poses.__getitem__, one.name, judged)
+        row["faces_missed"], row["faces_invented"] = count_differences(theirs, ours)
         row["ours_wrong"] = "not judged" if wrong is None else 0
     if hasattr(far, "distances"):
         error = np.abs(far.distances() - answers["distances"].distance).max()

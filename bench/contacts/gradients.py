@@ -10,7 +10,9 @@ import numpy as np
 
 import warp_abtree as ab
 
+from ..baselines.fcl import FclSlopes
 from ..baselines.warp_mesh import WarpMeshSlopes
+from ..shapes import pose_matrices
 from ..timing import host_clock, medians, one_core, time_call, time_rounds
 
 SAMPLE = Path(__file__).parents[2] / "scenes" / "07_place_without_overlap.py"
@@ -46,11 +48,8 @@ def run(device, quick=False):
     with one_core(device):
         times = time_rounds({"ours": time_call(lambda: query.run().gradient, device, clock)}, 3 if quick else 9)
     row |= {"ours_ms": medians(times)["ours"]}
-    matrices, meshes = np.tile(np.eye(4), (len(poses), 1, 1)), [m.mesh_at(m.lod_max)[:2] for m in models] * worlds
-    matrices[:, :3, 3] = poses[:, :3]
+    matrices, meshes = pose_matrices(poses), [m.mesh_at(m.lod_max)[:2] for m in models] * worlds
     with contextlib.suppress(ImportError):
-        from ..baselines.fcl import FclSlopes
-
         row |= compare("fcl", FclSlopes(meshes, matrices), pairs, margin, query, (1e-9, 1e-3), time.thread_time)
         row["ratio"] = round(row["fcl_ms"] / row["ours_ms"], 1)
     others = WarpMeshSlopes(meshes, matrices, device)

@@ -15,7 +15,7 @@ import warp_abtree as ab
 from ..cases.assembly import rest_nuts
 from ..meshes import NUT, ModelFolder
 from ..shapes import scene_of_poses
-from ..timing import make_runs, medians, one_core, ratio_of, time_in_turn, time_rounds
+from ..timing import medians, one_core, ratio_of, time_in_turn
 from .penetration import Contacts, near_contacts, penetration_allowed
 
 FULL = {"poses": 8, "worlds": {"cuda": 1024, "cpu": 8}, "repeats": 5}
@@ -101,6 +101,6 @@ def time_worlds(device, models, lods, matrices, asked, found, repeats) -> dict:
     faces = ab.Query(scene, "faces", pairs=pairs[:1])
     one.run(), faces.run()
     with one_core():
-        times = time_rounds(make_runs({"one": one.launch, "faces": faces.launch}, device, time.thread_time), repeats)
+        times = time_in_turn({"one": one.launch, "faces": faces.launch}, device, repeats, time.thread_time)
     taken |= medians(times)
     return {f"{name}_ms": ms for name, ms in taken.items()} | {"one_ratio": ratio_of(times["one"], times["faces"])}

@@ -91,7 +91,7 @@ def run(device, quick=False, only=PARTS):
             part = configurations[: max(2, count // 8)]
             for beyond in (None, 0.05):
                 ask = partial(robot.check, part, around, "distance", beyond)
-                yield about | {"output": "distance", "beyond": beyond} | time_once(device, clock, ask, part)
+                yield about | {"output": "distance", "beyond": beyond} | time_asked(device, clock, ask, part)
         if "edges" in only:
             # Between configurations that are free, a twentieth of the way to another.
             free = configurations[~robot.check(configurations, around)]
@@ -99,12 +99,13 @@ def run(device, quick=False, only=PARTS):
             ask = partial(robot.check_edges, starts, starts + 0.05 * (others - starts), around)
             rows = ask()
             row = {"output": "edges", "clear": rows["clear"].mean(), "undecided": rows["undecided"].mean()}
-            yield about | row | time_once(device, clock, ask, starts)
+            yield about | row | time_asked(device, clock, ask, starts)
 
 
-def time_once(device, clock, ask, asked):
-    """Return the columns of times of a question about configurations or edges."""
-    row = summarise(time_rounds({"ours": time_call(ask, device, clock)}, 1))
+def time_asked(device, clock, ask, asked, repeats=1, **others):
+    """Return the columns of times of a question about configurations or edges, and of others on the host."""
+    runs = {name: time_call(other, clock=clock) for name, other in others.items()}
+    row = summarise(time_rounds({"ours": time_call(ask, device, clock)} | runs, repeats))
     return {"asked": len(asked)} | row | {"per_s": round(1e3 * len(asked) / row["ours_ms"])}
 
 
@@ -112,12 +113,7 @@ def run_any(device, clock, robot, around, configurations, sizes):
     """Return the columns of yes or no, beside python-fcl."""
     fcl_robot, some = FclRobot(robot, around), configurations[: sizes["fcl"]]
     poses, found = robot.forward(some).numpy(), robot.check(configurations, around)
-    runs = {
-        "ours": time_call(lambda: robot.check(configurations, around), device, clock),
-        "fcl": time_call(lambda: fcl_robot.any(poses), clock=clock),
-    }
-    row = {"output": "any", "asked": len(configurations), "meet": found.mean()}
-    row["differ_from_fcl"] = (fcl_robot.any(poses) != found[: len(some)]).sum()
-    row |= summarise(time_rounds(runs, sizes["repeats"]))
-    per_s = {"per_s": round(1e3 * len(configurations) / row["ours_ms"])}
-    return row | per_s | {"fcl_per_s": round(1e3 * len(some) / row["fcl_ms"])}
+    ask, ask_fcl = partial(robot.check, configurations, around), partial(fcl_robot.any, poses)
+    row = {"output": "any", "meet": found.mean(), "differ_from_fcl": (ask_fcl() != found[: len(some)]).sum()}
+    row |= time_asked(device, clock, ask, configurations, sizes["repeats"], fcl=ask_fcl)
+    return row | {"fcl_per_s": round(1e3 * len(some) / row["fcl_ms"])}
