@@ -26,17 +26,13 @@ from . import tables
 NAMES = "assembly baselines broad budget build coarse distance exact frame gate gradients host motion points query"
 CASES = (*NAMES.split(), "libraries", "robot", "scale", "sweep", "update")
 STUDIES = {"paper": "study", "tradeoff": "study", "nightly": "nightly"}  # and the modules that run them
-MODULES = {name: f"bench.cases.{name}" for name in CASES} | {"motion": "bench.motions.case"}
-MODULES |= {
-    "broad": "bench.baselines.box_tree",
-    "gradients": "bench.contacts.gradients",
-    "libraries": "bench.baselines.libraries",
-    "points": "bench.contacts.points",
-}
-MODULES |= {"robot": "bench.motions.robot", "gate": "bench.gate.compare"}
+# Modules of cases that stand beside what they measure; all others are of their names.
+BESIDE = {"broad": "baselines.box_tree", "libraries": "baselines.libraries", "gradients": "contacts.gradients"}
+BESIDE |= {"points": "contacts.points", "gate": "gate.compare", "motion": "motions.case", "robot": "motions.robot"}
+MODULES = {name: f"bench.{BESIDE.get(name, f'cases.{name}')}" for name in CASES}
 MODULES |= {name: f"bench.studies.{module}" for name, module in STUDIES.items()}
 FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml
-# A case, and a study, takes the options that its function `run` has as arguments.
+# A case, and a study, takes the options that its function `run` has as arguments; a case a `wp.Device` before them.
 OPTIONS = {
     "quick": {"action": "store_true", "default": None, "help": "the smallest sizes, to try a case out"},
     "models": {"metavar": "DIR", "help": "keep the models there"},
@@ -80,8 +76,9 @@ def main(argv=None):
         return 0
     wp.config.log_level = wp.LOG_WARNING
     rows = []
-    for row in case.run(options.device, **asked):
-        rows.append({key: tables.plain(value) for key, value in row.items()})
+    device = wp.get_device(options.device)
+    for row in case.run(device, **asked):
+        rows.append({key: tables.plain(value) for key, value in ({"device": device.name} | row).items()})
         print("  ".join(f"{key}={value}" for key, value in rows[-1].items()), flush=True)
     if options.json:
         Path(options.json).write_text(json.dumps({**describe_run(), "rows": rows}, indent=1), encoding="utf-8")

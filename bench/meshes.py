@@ -15,6 +15,7 @@ from warp_abtree.model.mesh import load_mesh
 from .shapes import knot
 
 ROOT = Path(__file__).resolve().parents[1]
+NUT = ("factory-bolt-m20", "factory-nut-m20")
 WARP = ("warp:bear", "warp:bunny", "warp:rocks")
 # Collapsed from another mesh to so many faces, or the nearest number there is; originals of their own.
 COLLAPSED = {"bunny 57564": ("stanford-bunny", 57563), "fandisk 4204": ("fandisk", 4204)}

@@ -1,5 +1,7 @@
 """Meshes and poses of the benchmarks, reproducible to the bit."""
 
+import gc
+
 import numpy as np
 
 import warp_abtree as ab
@@ -52,11 +54,12 @@ def pair_poses(pair_count, distance, seed=0):
 
 
 def knot_batches(device, sizes):
-    """Yield numbers of pairs, and distances of their centres, that do not take long on a device."""
+    """Yield batches of pairs of a knot that do not take long on a device: columns, the model, and poses (2 P, 7)."""
+    model = ab.Model.from_arrays(*knot(sizes["faces"]), name="knot")
     for count in sizes["pairs"]:
         for distance in sizes["distances"]:
             if count <= (PAIRS_MAX_CPU if device.is_cpu else PAIRS_MAX_CLOSE if distance < FAR else count):
-                yield count, distance
+                yield {"pairs": count, "distance": distance}, model, pair_poses(count, distance)
 
 
 def random_poses(reach, *shape, seed=0):
@@ -94,11 +97,13 @@ def scene_of_objects(device, model, poses, world_size=None):
 
 def scene_of_pairs(device, model, poses):
     """Return a scene of objects at poses (2 P, 7), and its pairs (P, 2): 2p with 2p + 1."""
+    gc.collect()  # scenes and their queries hold each other
     return scene_of_objects(device, model, poses), np.arange(len(poses)).reshape(-1, 2)
 
 
 def scene_of_poses(device, model_a, model_b, poses):
     """Return a scene of A at the origin and B at each pose or matrix, and its pairs (0, 1), (0, 2), ..."""
+    gc.collect()
     scene = ab.Scene(device=device)
     scene.add(model_a)
     scene.add_many(model_b, poses)

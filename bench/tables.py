@@ -33,8 +33,15 @@ PANEL = (4.6, 3.9)  # inches
 
 
 def read_layout(name) -> dict:
-    """Return the tables and figures of a TOML file of this folder; a table's part is by default that of its name."""
+    """Return the tables and figures of a TOML file of this folder.
+
+    A table's part is by default that of its name; a column [name, heading, format], or its name alone, has by default
+    commas between thousands. What a figure does not say is taken from [figures].
+    """
     layout = tomllib.loads((HERE / name).read_text(encoding="utf-8"))
+    for table in layout.get("table", {}).values():
+        table["columns"] = [[each, each] if isinstance(each, str) else each for each in table["columns"]]
+    layout["figure"] = [layout.get("figures", {}) | figure for figure in layout.get("figure", [])]
     return layout | {"table": [{"name": key, "part": key} | table for key, table in layout.get("table", {}).items()]}
 
 
@@ -68,7 +75,7 @@ def write_json(path, study):
         file.write(f'{{"study": {json.dumps(study["study"])}, "parts": {{\n' + ",\n".join(parts) + "\n}}\n")
 
 
-def shown(value, form="") -> str:
+def shown(value, form=",") -> str:
     """Return a value as a table prints it."""
     if value is None or isinstance(value, bool):
         return {None: "-", True: "yes", False: "no"}[value]

@@ -37,6 +37,12 @@ def time_events(replay, device):
     return run
 
 
+def host_clock(device):
+    """Return the clock [s] of calls from the host: on the CPU the time that the thread ran, whatever else the machine
+    does; a GPU works while the thread waits."""
+    return time.thread_time if device.is_cpu else time.perf_counter
+
+
 def time_call(call, device="cpu", clock=time.perf_counter):
     """Return a callable that calls something, waits for the device and returns the time [ms].
 
@@ -90,13 +96,9 @@ def to_host(query):
 
 
 def time_on_host(calls: dict, device, repeats, clock=None) -> dict:
-    """Return the sorted times [ms] of calls that return their answers, in turn, by a clock [s].
-
-    None is on the CPU the time that the thread ran, whatever else the machine does; a GPU works while the thread waits.
-    """
-    clock = clock or (time.thread_time if device.is_cpu else time.perf_counter)
+    """Return the sorted times [ms] of calls that return their answers, in turn, by a clock [s] or `host_clock`."""
     with no_garbage_collection():
-        return time_in_turn(calls, wp.get_device("cpu"), repeats, clock)
+        return time_in_turn(calls, wp.get_device("cpu"), repeats, clock or host_clock(device))
 
 
 def medians(times: dict) -> dict:
@@ -143,13 +145,14 @@ def upper_half(values):
 
 
 @contextlib.contextmanager
-def one_core():
+def one_core(device=None):
     """Hold this thread, and launches, on one core; yield its number, None where the system has no such call.
 
-    Launches of operators made before too, which else share their work with threads that go on elsewhere.
+    Launches of operators made before too, which else share their work with threads that go on elsewhere. For a GPU,
+    where a device is given, nothing is held.
     """
-    with regime(cpu_threads=1):
-        if not hasattr(os, "sched_setaffinity"):
+    with contextlib.nullcontext() if device and device.is_cuda else regime(cpu_threads=1):
+        if not hasattr(os, "sched_setaffinity") or (device and device.is_cuda):
             yield None
             return
         allowed = os.sched_getaffinity(0)

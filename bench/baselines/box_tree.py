@@ -7,7 +7,7 @@ import warp as wp
 import warp_abtree as ab
 
 from ..shapes import random_directions
-from ..timing import make_runs, ratio_of, summarise, time_rounds
+from ..timing import ratio_of, summarise, time_in_turn
 
 FULL = ((16, 1), (1500, 1), (4096, 1), (8192, 2048), (8192, 128), (20_000, 1), (100_000, 1))  # objects, worlds
 QUICK = ((16, 1), (64, 16))
@@ -54,14 +54,13 @@ def run(device, quick=False):
 
     On a GPU both are graphs. The pairs of both are compared.
     """
-    device, box = wp.get_device(device), ab.Model.load(trimesh.creation.box((1, 1, 1)))
+    box = ab.Model.load(trimesh.creation.box((1, 1, 1)))
     for count, worlds in QUICK if quick else FULL:
         rng, each = np.random.default_rng(0), count // worlds
         places = rng.uniform(0, SPACING * each ** (1 / 3), (count, 3))
         scene = ab.Scene(device)
-        scene.add_many(
-            box, np.concatenate([places, random_directions(rng, count, 4)], 1), np.repeat(range(worlds), each)
-        )
+        poses = np.concatenate([places, random_directions(rng, count, 4)], 1)
+        scene.add_many(box, poses, np.repeat(range(worlds), each))
         pairs = scene.broad_phase()
         ours = ab.Query(scene, "any", capacity=ab.Buffers(pairs=len(pairs))).broad_phase
         ours.launch()
@@ -70,8 +69,7 @@ def run(device, quick=False):
         theirs = tree.pairs.numpy()[: int(tree.count.numpy()[0])].reshape(-1, 2)
         if not np.array_equal(theirs[np.lexsort(theirs.T[::-1])], pairs):
             raise RuntimeError("the tree finds other pairs")
-        times = time_rounds(
-            make_runs({"ours": ours.launch, "peer": tree.launch}, device), REPEATS["cuda" if device.is_cuda else "cpu"]
-        )
-        row = {"device": device.name, "objects": count, "worlds": worlds, "pairs": len(pairs)}
+        launches = {"ours": ours.launch, "peer": tree.launch}
+        times = time_in_turn(launches, device, REPEATS["cuda" if device.is_cuda else "cpu"])
+        row = {"objects": count, "worlds": worlds, "pairs": len(pairs)}
         yield row | summarise(times) | {"ratio": ratio_of(times["peer"], times["ours"])}

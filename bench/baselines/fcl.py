@@ -5,7 +5,8 @@ answer a pose from which `face_pairs` reads all intersecting face pairs. Without
 """
 
 import numpy as np
-from trimesh.transformations import rotation_matrix
+
+from .warp_mesh import move_six_ways
 
 ALL_CONTACTS = 2**31 - 1
 
@@ -156,16 +157,11 @@ class FclSlopes:
 
     def slopes(self, pairs, margin, step=1e-6):
         """Return distances (p,), and how each changes by the motions of the second object (p, 6), 0 beyond margin."""
-        distances, slopes = np.empty(len(pairs)), np.zeros((len(pairs), 6))
-        turns = [rotation_matrix(step, axis)[:3, :3] for axis in np.eye(3)]
-        for p, (i, j) in enumerate(pairs):
-            distances[p] = self.distance(i, j)
-            for axis in range(6 if distances[p] < margin else 0):
-                moved = self.matrices[j].copy()
-                if axis < 3:
-                    moved[axis, 3] += step
-                else:
-                    moved[:3, :3] = turns[axis - 3] @ moved[:3, :3]
+        distances, slopes = np.array([self.distance(i, j) for i, j in pairs]), np.zeros((len(pairs), 6))
+        near = np.flatnonzero(distances < margin)
+        for p, ways in zip(near, move_six_ways(self.matrices[pairs[near, 1]], step)):
+            i, j = pairs[p]
+            for axis, moved in enumerate(ways):
                 self._place(self.objects[j], moved)
                 slopes[p, axis] = (self.distance(i, j) - distances[p]) / step
             self._place(self.objects[j], self.matrices[j])

@@ -141,7 +141,7 @@ def measure(models, matrices, others, device, repeats):
     """
     before, (_, first) = taken_memory(device), cook_meshes(models, device)  # compiles
     meshes, seconds = cook_meshes(models, device)
-    row = {"device": device.name, "worlds": len(matrices), "fields_mib": taken_memory(device) - before}
+    row = {"worlds": len(matrices), "fields_mib": taken_memory(device) - before}
     row |= {"cook_first_s": first, "cook_s": seconds}
     model = make_model(meshes, len(matrices), device)
     poses, others = (body_poses(m) for m in (matrices, others))

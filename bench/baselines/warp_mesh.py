@@ -31,6 +31,15 @@ def measure_overlap_kernel(
     distance_out[p, way] = wp.min(least, least_height(wp.mesh_get(a).points, here, b, there))
 
 
+def move_six_ways(matrices, step):
+    """Return matrices (n, 4, 4) moved by a step along each axis and turned about each [rad], (n, 6, 4, 4)."""
+    moved = np.repeat(matrices[:, None], 6, 1)
+    moved[:, range(3), range(3), 3] += step
+    for k, axis in enumerate(np.eye(3)):
+        moved[:, 3 + k, :3, :3] = rotation_matrix(step, axis)[:3, :3] @ moved[:, 3 + k, :3, :3]
+    return moved
+
+
 class WarpMeshSlopes:
     """As `FclSlopes`, by `wp.mesh_query_point`: where two edges are nearest, it takes objects for farther apart."""
 
@@ -54,9 +63,5 @@ class WarpMeshSlopes:
         second, slopes = self.matrices[pairs[:, 1]], np.zeros((len(pairs), 6))
         distances = self._measure(pairs, second[:, None])[:, 0]
         near = np.flatnonzero(distances < margin)
-        moved = np.repeat(second[near, None], 6, 1)
-        moved[:, range(3), range(3), 3] += step
-        for k, axis in enumerate(np.eye(3)):
-            moved[:, 3 + k, :3, :3] = rotation_matrix(step, axis)[:3, :3] @ moved[:, 3 + k, :3, :3]
-        slopes[near] = (self._measure(pairs[near], moved) - distances[near, None]) / step
+        slopes[near] = (self._measure(pairs[near], move_six_ways(second[near], step)) - distances[near, None]) / step
         return distances, slopes

@@ -5,6 +5,7 @@ alike, 64 threads a block, and the constructor that answers fastest (`find_const
 triangle test has an absolute epsilon and invents pairs on fine meshes.
 """
 
+import contextlib
 import functools
 
 import numpy as np
@@ -159,9 +160,7 @@ def find_constructor(vertices, faces, poses, device, repeats=5) -> str:
     for name in CONSTRUCTORS:
         if name == "lbvh" and device.is_cpu:  # there it is sah
             continue
-        try:
+        with contextlib.suppress(RuntimeError, ValueError):  # not compiled in
             launches[name] = BvhPosed(vertices, faces, poses, 0, device, name).launch
-        except (RuntimeError, ValueError):  # not compiled in
-            continue
     times = medians(time_in_turn(launches, device, repeats))
     return min(times, key=times.get)

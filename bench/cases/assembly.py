@@ -11,13 +11,12 @@ import importlib.util
 from functools import partial
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 
 from ..baselines import newton_nuts
 from ..baselines.fcl import Fcl
-from ..meshes import ModelFolder
+from ..meshes import NUT, ModelFolder
 from ..motions import hammered
 from ..shapes import centre_and_radius, scene_of_poses
 from ..timing import medians, one_core, ratio_of, time_on_host, to_host
@@ -32,7 +31,6 @@ GEAR_TURN = 0.03  # that teeth have room for, at most, either way
 
 def run(device, quick=False, only=None, count=None, models=None):
     """Yield a row a workload: times a pose [ms] of ours, and those of python-fcl over ours."""
-    device = wp.get_device(device)
     sizes = QUICK if quick else FULL
     folder = ModelFolder(models)
     for name, files, place in CASES:
@@ -133,10 +131,10 @@ def place_gears(models, count):
 
 
 CASES = (
-    ("nut on bolt", ("factory-bolt-m20", "factory-nut-m20"), place_nut),
+    ("nut on bolt", NUT, place_nut),
     ("peg in hole", ("factory-hole-8mm", "factory-peg-8mm"), place_peg),
     ("gears", ("factory-gear-medium", "factory-gear-small"), place_gears),
-    ("newton", ("factory-bolt-m20", "factory-nut-m20"), None),
+    ("newton", NUT, None),
 )
 
 
@@ -148,7 +146,7 @@ def measure(name, models, matrices, device, repeats):
     found = {output: query.run() for output, query in queries.items()}
     if not np.array_equal(found["any"].any, found["faces"].count > 0):
         raise RuntimeError("outputs 'any' and 'faces' of ours differ")
-    row = {"device": device.name, "workload": name, "faces": " x ".join(str(len(mesh[1])) for mesh in meshes)}
+    row = {"workload": name, "faces": " x ".join(str(len(mesh[1])) for mesh in meshes)}
     row |= {"poses": len(pairs), "meet": found["any"].any.sum(), "hits": found["faces"].count.sum()}
     fcl = None
     try:

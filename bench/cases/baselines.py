@@ -3,11 +3,10 @@
 A workload is one model against another at 200 poses, half of them intersecting. Answers are compared before anything is
 timed. Times are those that the thread ran. Ours is timed from the launch to the sorted result on the host; a baseline
 over a loop of its own calls, objects made before, until the library has its contacts; no face numbers are read from
-them.
+them. `measure` serves the case `libraries` too.
 """
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 
@@ -15,7 +14,7 @@ from ..baselines.fcl import Fcl, Trimesh
 from ..meshes import real_meshes
 from ..shapes import centre_and_radius, knot, pose_matrices, random_directions, scene_of_poses
 from ..timing import one_core, ratio_of, summarise, time_on_host, to_host
-from ..verify import judge_disputed
+from ..verify import count_differences, judge_disputed
 
 REAL = {
     "cow-cow": ("cow", "cow"),
@@ -24,19 +23,26 @@ REAL = {
 }
 FULL = {"faces": 5000, "poses": 200, "repeats": 5}
 QUICK = {"faces": 300, "poses": 6, "repeats": 1}
-BASELINES = (Fcl, Trimesh)
 
 
 def run(device, quick=False):
     """Yield one row a workload and baseline (column peer): differences, queries a second of both, and ratios (ours over
     the peer)."""
-    device = wp.get_device(device)
     sizes = QUICK if quick else FULL
     knots = ab.Model.from_arrays(*knot(sizes["faces"]), name="knot")
     for name, models in {"knot-knot": (knots, knots), **real_meshes(REAL)}.items():
+        matrices = half_in_contact(models, sizes["poses"])
+        places = dict.fromkeys(("any", "faces"), np.arange(len(matrices)))
         with one_core() as core:
-            for row in measure(models, device, sizes["poses"], sizes["repeats"]):
-                yield {"device": device.name, "workload": name, "core": core} | row
+            answers, rows, times = measure(models, device, (Fcl, Trimesh), matrices, places, sizes["repeats"])
+        about = {"workload": name, "core": core, "faces": " x ".join(str(model.face_count) for model in models)}
+        about |= {"poses": len(matrices), "meet": answers["any"].any.sum(), "hits": len(answers["faces"].faces)}
+        for library, row in rows.items():
+            for output, taken in times.items() if "skipped" not in row else ():
+                shown = {f"ours_{output}": taken["ours"], f"peer_{output}": taken[library]}
+                row |= summarise(shown) | {f"{output}_ratio": ratio_of(taken[library], taken["ours"])}
+                row |= {f"{key}_per_s": round(1e3 * len(matrices) / np.median(ms)) for key, ms in shown.items()}
+            yield about | {"peer": library} | row
 
 
 def random_matrices(rng, model_a, model_b, count):
@@ -58,45 +64,56 @@ def half_in_contact(models, count):
     return rng.permutation([*kept[True][: (count + 1) // 2], *kept[False][: count // 2]])
 
 
-def measure(models, device, count, repeats):
-    """Yield one row a baseline; raise a RuntimeError where our outputs differ, or the oracle sides with a baseline."""
+def measure(models, device, kinds, matrices, places, repeats, clock=None, judged=None):
+    """Return our results by question, each library's row of differences, and times by question and library.
+
+    Raise a RuntimeError where our outputs differ, or the oracle sides with a library.
+
+    Args:
+        kinds: Libraries, as those of `bench.baselines.fcl`.
+        matrices: Poses of B, float64 (n, 4, 4).
+        places: Which of them each question is asked at: "any" and "faces" at the same ones, and "distances".
+        clock, judged: See `time_on_host` and, for most, `judge_disputed`.
+    """
     a = models[0].mesh_at(models[0].lod_max)[:2]
     meshes = a, a if models[1] is models[0] else models[1].mesh_at(models[1].lod_max)[:2]
-    matrices = half_in_contact(models, count)
     scene, pairs = scene_of_poses(device, *models, matrices)
-    queries = {output: ab.Query(scene, output, pairs=pairs) for output in ("any", "faces")}
-    answers = {output: query.run() for output, query in queries.items()}
-    any_hit, faces = answers["any"].any, answers["faces"].faces
-    if not np.array_equal(any_hit, answers["faces"].count > 0):
+    queries = {output: ab.Query(scene, output, pairs=pairs[places[output]]) for output in ("any", "faces")}
+    answers, ours = {}, {output: to_host(query) for output, query in queries.items()}
+    if "distances" in places:
+        queries["distances"] = apart = ab.DistanceQuery(scene, pairs[places["distances"]])
+        ours["distances"] = lambda: (apart.forget(), apart.launch(), apart.result())[2]
+    answers |= {question: query.run() for question, query in queries.items()}
+    if not np.array_equal(answers["any"].any, answers["faces"].count > 0):
         raise RuntimeError("outputs 'any' and 'faces' of ours differ")
-    about = {"faces": " x ".join(str(len(mesh[1])) for mesh in meshes), "poses": count}
-    about |= {"meet": any_hit.sum(), "hits": len(faces)}
-    made, rows = {}, {}
-    for kind in BASELINES:
+    made, rows, times = {}, {}, {}
+    for kind in kinds:
         try:
-            made[kind.name] = kind(*meshes, matrices)
-            rows[kind.name] = compare(made[kind.name], any_hit, faces, meshes, matrices)
+            made[kind.name] = {question: kind(*meshes, matrices[some]) for question, some in places.items()}
+            rows[kind.name] = compare(made[kind.name], answers, meshes, matrices[places["faces"]], judged)
         except ImportError as error:
             rows[kind.name] = {"skipped": str(error)}
-    for output, query in queries.items():
-        launches = {"ours": to_host(query)} | {name: getattr(one, output) for name, one in made.items()}
-        times = time_on_host(launches, device, repeats)
-        if not np.array_equal(query.result().any, any_hit):
-            raise RuntimeError(f"the timed answer of {output!r} differs from the checked one")
-        for name in made:
-            shown = {f"ours_{output}": times["ours"], f"peer_{output}": times[name]}
-            rows[name] |= summarise(shown) | {f"{output}_ratio": ratio_of(times[name], times["ours"])}
-            rows[name] |= {f"{key}_per_s": round(1e3 * count / np.median(ms)) for key, ms in shown.items()}
-    for name, row in rows.items():
-        yield about | {"peer": name} | row
+    for question, call in ours.items():
+        asked = {name: getattr(one[question], question, None) for name, one in made.items()}
+        calls = {"ours": call} | {name: ask for name, ask in asked.items() if ask}
+        times[question] = time_on_host(calls, device, repeats, clock)
+        if not np.array_equal(queries[question].result().any, answers[question].any):
+            raise RuntimeError(f"the timed answer of {question!r} differs from the checked one")
+    return answers, rows, times
 
 
-def compare(baseline, found_any, found_faces, meshes, matrices):
-    """Return what a baseline misses and invents beside our answers, which the oracle must not find wrong."""
-    answer = np.array(baseline.any(), bool)
-    ours = {tuple(row) for row in found_faces.tolist()}
-    theirs = {(pose, *pair) for pose, one in enumerate(baseline.faces()) for pair in baseline.face_pairs(one)}
-    judged = judge_disputed(list(theirs), list(ours), meshes, lambda pose: (np.eye(4), matrices[pose]), baseline.name)
-    row = {"any_missed": (found_any & ~answer).sum(), "any_invented": (answer & ~found_any).sum()}
-    row |= {"faces_missed": len(ours - theirs), "faces_invented": len(theirs - ours)}
-    return row | {"ours_wrong": "not judged" if judged is None else 0}
+def compare(made, answers, meshes, matrices, judged) -> dict:
+    """Return what a library misses and invents beside our answers, where it answers; the oracle finds none wrong."""
+    met, answer = answers["any"].any, np.array(made["any"].any(), bool)
+    row = {"any_missed": (met & ~answer).sum(), "any_invented": (answer & ~met).sum()}
+    one, far = made["faces"], made.get("distances")
+    if hasattr(one, "faces"):
+        ours, poses = answers["faces"].faces, [(np.eye(4), matrix) for matrix in matrices]
+        theirs = list({(pose, *pair) for pose, found in enumerate(one.faces()) for pair in one.face_pairs(found)})
+        wrong = judge_disputed(theirs, ours, meshes, poses.__getitem__, one.name, judged)
+        row["faces_missed"], row["faces_invented"] = count_differences(theirs, ours)
+        row["ours_wrong"] = "not judged" if wrong is None else 0
+    if hasattr(far, "distances"):
+        error = np.abs(far.distances() - answers["distances"].distance).max()
+        row["distance_error"] = error / np.ptp(meshes[0][0], axis=0).max()
+    return row

@@ -9,14 +9,12 @@ Last, what control costs: a budget that the finest LODs keep makes the controlle
 all of its cost and none of its gain.
 """
 
-import contextlib
 import gc
 import importlib.util
 import time
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 from warp_abtree.app import load_scene
@@ -52,10 +50,9 @@ def run(device, quick=False, plots=None):
     the median frame at the finest LODs, half of its runs before and half after those under control; total_ms that under
     the controller, with the medians of its stages.
     """
-    device = wp.get_device(device)
     kind = "cuda" if device.is_cuda else "cpu"
-    with contextlib.nullcontext() if device.is_cuda else one_core() as core:
-        options = {} if core is None else {"clock": time.thread_time}
+    options = {} if device.is_cuda else {"clock": time.thread_time}
+    with one_core(device):
         for name in NAMES:
             collect()
             loaded = read_scene(name, device, QUICK_OBJECTS if quick else OBJECTS[kind][name])
@@ -64,7 +61,7 @@ def run(device, quick=False, plots=None):
                 asked = options if budget is None else options | {"budget_ms": budget}
                 frame = run_controller(loaded, controller, OUTPUT[kind], QUICK_FRAMES if quick else FRAMES, asked)
                 budget = budget or float(np.median(steady_costs(frame))) / BREACH
-                row = {"scene": name, "device": device.name, "objects": loaded.scene.object_count}
+                row = {"scene": name, "objects": loaded.scene.object_count}
                 yield row | {"budget_ms": budget, "controller": controller} | describe_hold(frame, budget)
                 runs[controller] = frame.history
             if plots is not None:
@@ -135,7 +132,7 @@ def find_stages(loaded, name, frames, options):
     """Yield a row at the finest LODs of a scene, and one at the coarsest."""
     for lods in ("finest", "coarsest"):
         rows = run_frames(loaded, frames, None, lods == "coarsest", options)
-        row = {"scene": name, "device": loaded.scene.device.name, "objects": loaded.scene.object_count, "lods": lods}
+        row = {"scene": name, "objects": loaded.scene.object_count, "lods": lods}
         stages = {stage: [getattr(row, stage) for row in rows] for stage in (*STAGES, "total_ms")}
         yield row | {"hits": float(np.median([row.hits for row in rows]))} | medians(stages)
 
@@ -149,7 +146,7 @@ def compare(loaded, name, frames):
         finest += run_frames(loaded, frames, None)
         stand, total = (float(np.median([row.total_ms for row in rows])) for rows in (finest, controlled))
         stages = medians({stage: [getattr(row, stage) for row in controlled] for stage in STAGES})
-        row = {"scene": name, "device": loaded.scene.device.name, "objects": loaded.scene.object_count}
+        row = {"scene": name, "objects": loaded.scene.object_count}
         row |= {"budget": part, "finest_ms": stand, "total_ms": total} | stages
         yield row | {"error_mean": controlled[-1].error_mean, "ratio": total / stand}
 

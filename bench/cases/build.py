@@ -8,15 +8,13 @@ import gc
 import tempfile
 import time
 
-import warp as wp
-
 import warp_abtree as ab
 from warp_abtree import testing
 
 from ..baselines.wp_bvh import FaceBvh
 from ..meshes import ModelFolder
 from ..shapes import knot
-from ..timing import summarise, time_call
+from ..timing import host_clock, summarise, time_call
 
 FULL = {"faces": (200, 1000, 5000, 20_000, 60_000, 250_000, 1_000_000), "repeats": 5}
 QUICK = {"faces": (200, 600), "repeats": 2}
@@ -31,7 +29,6 @@ def run(device, quick=False, models=None):
     Times are those that one thread of the host ran, in turn with the baselines'; of the device only bvh_build, a wp.Bvh
     over the boxes of the faces.
     """
-    device = wp.get_device(device)
     sizes = QUICK if quick else FULL
     build(*knot(200), "")  # compiles what there is to compile
     with tempfile.TemporaryDirectory() as folder:
@@ -74,7 +71,7 @@ def run_mesh(device, face_target, repeats, folder):
     path = folder.file(name)
     path.parent.mkdir(parents=True, exist_ok=True)
     model, first = build(vertices, faces, name)
-    row = {"case": "build", "device": device.name, "faces": len(faces), "lod_max": model.lod_max}
+    row = {"case": "build", "faces": len(faces), "lod_max": model.lod_max}
     model.save(path)
     if ab.Model.open(path).digest != model.digest:
         raise RuntimeError("the model saved and opened is another")
@@ -83,8 +80,7 @@ def run_mesh(device, face_target, repeats, folder):
     if simplify:
         calls[BASELINE] = simplify
     runs = {name: time_call(call, "cpu", time.thread_time) for name, call in calls.items()}
-    clock = time.thread_time if device.is_cpu else time.perf_counter
-    runs["bvh_build"] = time_call(FaceBvh(vertices, faces, device).rebuild, device, clock)
+    runs["bvh_build"] = time_call(FaceBvh(vertices, faces, device).rebuild, device, host_clock(device))
     times = {}
     for turn in range(1 if len(faces) > LARGE else repeats):
         found = build(vertices, faces, name)[1] if turn else first

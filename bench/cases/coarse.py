@@ -1,14 +1,11 @@
 """Queries at coarse LODs, each output, beside the tuned wp.Bvh over the same coarse meshes: what the dial saves."""
 
-import gc
-
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 
 from ..baselines.wp_bvh import BvhPosed
-from ..shapes import KNOT_PAIRS, knot, knot_batches, pair_poses, scene_of_pairs
+from ..shapes import KNOT_PAIRS, knot_batches, scene_of_pairs
 from ..timing import ratio_of, summarise, time_in_turn
 
 QUICK = {"faces": 300, "pairs": (2,), "distances": (0.2,), "repeats": 3}
@@ -21,19 +18,14 @@ def run(device, quick=False):
     faces are those active at the LOD; ratios are the baseline's times over ours, contact_ratio contacts over faces;
     hit_ns is the time of all face pairs for each that is found.
     """
-    device = wp.get_device(device)
     sizes = QUICK if quick else KNOT_PAIRS
-    model = ab.Model.from_arrays(*knot(sizes["faces"]))
-    for pair_count, distance in knot_batches(device, sizes):
+    for about, model, poses in knot_batches(device, sizes):
         for fraction in FRACTIONS:
-            row = {"device": device.name, "pairs": pair_count, "distance": distance, "fraction": fraction}
-            poses = pair_poses(pair_count, distance)
-            yield row | run_batch(device, model, fraction, poses, sizes["repeats"])
+            yield about | {"fraction": fraction} | run_batch(device, model, fraction, poses, sizes["repeats"])
 
 
 def run_batch(device, model, fraction, poses, repeats):
     """Return the columns of one batch of pairs at one LOD."""
-    gc.collect()  # scenes and their queries hold each other
     lod = model.lod_max if fraction == 1 else model.lod_for(fraction=fraction)
     mesh = model.mesh_at(lod)[:2]
     scene, pairs = scene_of_pairs(device, model, poses)

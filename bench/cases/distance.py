@@ -12,7 +12,6 @@ without signs, Warp's query with its own and without.
 The part `gap` is contacts with a gap beside contacts without, of knots: times by gap, and how many more.
 """
 
-import contextlib
 import time
 
 import numpy as np
@@ -21,10 +20,9 @@ import warp as wp
 
 import warp_abtree as ab
 
-from .. import shapes
+from .. import shapes, timing
 from ..baselines.fcl import Fcl
-from ..meshes import ModelFolder, knot_model, mesh_file
-from ..timing import medians, no_garbage_collection, one_core, ratio_of, time_call, time_in_turn, time_rounds
+from ..meshes import NUT, ModelFolder, knot_model, mesh_file
 from .assembly import place_nut
 
 FULL = {"poses": 32, "counts": (1, 1024, 65536), "knot": 5000, "repeats": 7}
@@ -36,7 +34,6 @@ GAP_QUICK = {"faces": 300, "pairs": (4,), "distances": (0.2,), "repeats": 2}
 GAPS = 0.0, 1e-4, 3e-4, 1e-3, 3e-3  # of the mesh's size
 PARTS = ("nearest", "points", "gap")
 MESHES = ("cow", "rocker-arm", "stanford-bunny")
-NUT = ("factory-bolt-m20", "factory-nut-m20")
 
 
 def run(device, quick=False, only=PARTS):
@@ -46,7 +43,6 @@ def run(device, quick=False, only=PARTS):
     part `gap` a row a number of pairs, distance of their centres, and gap: more is contacts over those without a gap,
     ratio the time over that without one.
     """
-    device = wp.get_device(device)
     if "nearest" in only:
         yield from measure_all(device, quick)
     if "points" in only:
@@ -59,9 +55,9 @@ def run(device, quick=False, only=PARTS):
         yield measure_points("torus", torus, device, 300 if quick else POINTS, True)
     if "gap" in only:
         sizes = GAP_QUICK if quick else GAP_FULL
-        knots = knot_model(sizes["faces"])
-        for count, distance in shapes.knot_batches(device, sizes):
-            yield from time_gaps(device, knots, count, distance, sizes["repeats"])
+        for about, model, poses in shapes.knot_batches(device, sizes):
+            for row in time_gaps(device, model, poses, sizes["repeats"]):
+                yield about | row
 
 
 def measure_all(device, quick):
@@ -113,16 +109,16 @@ def measure_points(name, model, device, count, has_signs):
         "host": lambda: ab.signed_distance(model, points, device=device.alias, signed=signed),
         "peer": lambda: wp.launch(ask_mesh_kernel, count, inputs, device=device),
     }
-    clock = time.thread_time if device.is_cpu else time.perf_counter
-    with one_core() if device.is_cpu else contextlib.nullcontext():
-        times = time_rounds({who: time_call(call, device, clock) for who, call in calls.items()}, 5)
+    with timing.one_core(device):
+        runs = {who: timing.time_call(call, device, timing.host_clock(device)) for who, call in calls.items()}
+        times = timing.time_rounds(runs, 5)
     truth = calls["host"]()
-    row = {"device": device.name, "workload": name, "faces": model.face_count, "points": count, "signed": signed}
+    row = {"workload": name, "faces": model.face_count, "points": count, "signed": signed}
     row |= {"peer_signed": has_signs, "inside": np.count_nonzero(truth < 0) if signed else None}
     if signed and has_signs:
         row["peer_wrong_sides"] = np.count_nonzero((truth < 0) != (found.numpy() < 0))
     row |= {f"{who}_us": 1e3 * float(np.median(times[who])) / count for who in calls}
-    return row | {"point_ratio": ratio_of(times["peer"], times["ours"])}
+    return row | {"point_ratio": timing.ratio_of(times["peer"], times["ours"])}
 
 
 def measure(name, models, matrices, device, repeats):
@@ -131,19 +127,19 @@ def measure(name, models, matrices, device, repeats):
     query, fresh = ab.DistanceQuery(scene, pairs), ab.DistanceQuery(scene, pairs)
     found = fresh.run()
     query.run()
-    row = {"device": device.name, "workload": name, "faces": " x ".join(str(model.face_count) for model in models)}
+    row = {"workload": name, "faces": " x ".join(str(model.face_count) for model in models)}
     row |= {"poses": len(pairs), "meet": found.any.sum(), "median_gap": np.median(found.distance)}
     row |= {"node_tests": found.node_tests.mean(), "face_tests": found.triangle_tests.mean()}
     launches = {"fresh": lambda: (fresh.forget(), fresh.launch()), "again": query.launch}
-    with one_core():
+    with timing.one_core():
         if device.is_cpu:
             launches["calls"] = make_calls(models, matrices, device)
             try:
                 launches["fcl"] = make_fcl(models, matrices, found, row).distances
             except ImportError as error:
                 row["fcl_skipped"] = str(error)
-        with no_garbage_collection():
-            times = medians(time_in_turn(launches, device, repeats, time.thread_time))
+        with timing.no_garbage_collection():
+            times = timing.medians(timing.time_in_turn(launches, device, repeats, time.thread_time))
     row |= {f"{key}_ms": value / len(pairs) for key, value in times.items()}
     ours = [key for key in times if key != "fcl"] if "fcl" in times else []
     return row | {f"{key}_fcl_ratio": round(times["fcl"] / times[key], 2) for key in ours}
@@ -177,9 +173,9 @@ def make_fcl(models, matrices, found, row):
     return fcl
 
 
-def time_gaps(device, model, count, distance, repeats):
+def time_gaps(device, model, poses, repeats):
     """Yield the rows of one batch; raise a RuntimeError where what intersects is not the same with a gap."""
-    scene, pairs = shapes.scene_of_pairs(device, model, shapes.pair_poses(count, distance))
+    scene, pairs = shapes.scene_of_pairs(device, model, poses)
     plain = scene.intersect(pairs, output="contacts")
     queries, found = {}, {}
     for gap in (None, *GAPS):
@@ -191,11 +187,11 @@ def time_gaps(device, model, count, distance, repeats):
         found[gap] = len(result.contacts)
         queries[gap] = ab.ContactQuery(scene, pairs, capacity=max(1, found[gap]), gap=asked)
         queries[gap].grow()
-    with one_core(), no_garbage_collection():
-        clock = [time.thread_time] if device.is_cpu else []
-        times = time_in_turn({gap: query.launch for gap, query in queries.items()}, device, repeats, *clock)
-    middle = medians(times)
+    with timing.one_core(), timing.no_garbage_collection():
+        launches = {gap: query.launch for gap, query in queries.items()}
+        times = timing.time_in_turn(launches, device, repeats, timing.host_clock(device))
+    middle = timing.medians(times)
     for gap in GAPS:
-        row = {"device": device.name, "pairs": count, "distance": distance, "gap": gap, "contacts": found[gap]}
+        row = {"gap": gap, "contacts": found[gap]}
         row |= {"more": found[gap] / max(1, found[None]), "without_ms": middle[None], "with_ms": middle[gap]}
-        yield row | {"ratio": ratio_of(times[gap], times[None]), "meet": np.count_nonzero(plain.any)}
+        yield row | {"ratio": timing.ratio_of(times[gap], times[None]), "meet": np.count_nonzero(plain.any)}

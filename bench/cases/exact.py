@@ -7,7 +7,6 @@ import functools
 import itertools
 import multiprocessing
 import sys
-import time
 
 import numpy as np
 import warp as wp
@@ -17,7 +16,7 @@ from warp_abtree import testing
 from warp_abtree.testing import EXACT, FILTER, FLOAT32, UNCERTAIN
 
 from ..shapes import knot, pair_poses, scene_of_pairs
-from ..timing import ratio_of, summarise, time_in_turn
+from ..timing import ratio_of, summarise, time_call, time_in_turn
 from ..triangle_pairs import ADVERSARIAL, make_chunk
 from ..verify import count_differences, load_oracle
 
@@ -38,7 +37,6 @@ def run(device, count=None, quick=False):
     truth, fractions left to float64 and to exact signs, error rate of float32 alone, time a pair [ns]; then one a
     scene of meshes. Raise a RuntimeError where an answer was wrong, or the tests' oracle is not at hand.
     """
-    device = wp.get_device(device)
     if load_oracle() is None:
         raise RuntimeError("the exact oracle is not at hand; run this in a checkout with its tests")
     one = make_chunk(("random", 0, 1))
@@ -51,7 +49,7 @@ def run(device, count=None, quick=False):
         for kind, group in itertools.groupby(chunks, key=lambda chunk: chunk[0][0]):
             tally = sum(check_chunk(job, truth, device) for job, truth in group)
             wrong += tally[2]
-            yield describe_tally(device, kind, tally)
+            yield describe_tally(kind, tally)
     if wrong:
         raise RuntimeError("exact signs gave a wrong answer")
     yield from measure_meshes(device, QUICK if quick else FULL)
@@ -71,7 +69,7 @@ def measure_meshes(device, sizes):
         times = time_in_turn({p: query.launch for p, query in queries.items()}, device, sizes["repeats"])
         exact = found["exact"]
         tests = exact.triangle_tests.sum()
-        row = {"device": device.name, "scene": name, "hits": len(exact.faces), "triangle_tests": tests}
+        row = {"scene": name, "hits": len(exact.faces), "triangle_tests": tests}
         row |= {"to_float64": exact.float64_tests.sum() / tests, "to_exact": exact.exact_tests.sum() / tests}
         row["float32_missed"], row["float32_invented"] = count_differences(found["float32"].faces, exact.faces)
         row |= summarise(times)
@@ -139,25 +137,21 @@ def float32_pair_kernel(
 
 
 def time_launch(kernel, inputs, pairs, dtype, device):
-    """Return a kernel's answers for pairs, int32 (count,), and the time of its launch [s]."""
+    """Return a kernel's answers for pairs, int32 (count,), and the time of its launch [ms]."""
     corners = wp.array(np.ascontiguousarray(pairs).reshape(-1, 6, 3), dtype=dtype, device=device)
     answers = wp.zeros(len(pairs), dtype=wp.int32, device=device)
-    if not len(pairs):
-        return answers.numpy(), 0.0
-    wp.synchronize_device(device)
-    begin = time.perf_counter()
-    wp.launch(kernel, dim=len(pairs), inputs=[*inputs, corners, answers], device=device)
-    wp.synchronize_device(device)
-    return answers.numpy(), time.perf_counter() - begin
+    launch = functools.partial(wp.launch, kernel, len(pairs), [*inputs, corners, answers], device=device)
+    taken = time_call(launch, device)() if len(pairs) else 0.0
+    return answers.numpy(), taken
 
 
 def ask(mode, pairs, device):
-    """Return the answers of signs in a mode, and the time [s]."""
+    """Return the answers of signs in a mode, and the time [ms]."""
     return time_launch(pair_test(int(mode)), [], pairs, wp.vec3d, device)
 
 
 def ask_float32(pairs, device, proven=True):
-    """Return the answers of the float32 stage, with its bound or without, and the time [s]."""
+    """Return the answers of the float32 stage, with its bound or without, and the time [ms]."""
     # Coordinates of at most 1 are off by at most 2^-25, differences by twice as much.
     bound = [1.02 * 2.0**-24, float(testing.FLOAT32_UNIT)] if proven else [0.0, 0.0]
     return time_launch(float32_pair_kernel, bound, unit_size(pairs).astype(np.float32), wp.vec3, device)
@@ -197,10 +191,10 @@ def check_chunk(job, truth, device):
     return np.array([*counts, single_time, double_time, exact_time, unproven_time + rest_time], float)
 
 
-def describe_tally(device, kind, tally):
+def describe_tally(kind, tally):
     """Turn a tally into a row."""
     pairs, hits, wrong, to_float64, to_exact, unproven, *times = tally.tolist()
     shares = {"meet": hits, "to_float64": to_float64, "to_exact": to_exact, "float32_errors": unproven}
-    row = {"device": device.name, "kind": kind, "pairs": int(pairs), "disagreements": int(wrong)}
+    row = {"kind": kind, "pairs": int(pairs), "disagreements": int(wrong)}
     row |= {name: count / pairs for name, count in shares.items()}
-    return row | {name: 1e9 * t / pairs for name, t in zip(STAGES, times, strict=True)}
+    return row | {name: 1e6 * t / pairs for name, t in zip(STAGES, times, strict=True)}

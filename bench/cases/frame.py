@@ -105,7 +105,6 @@ def run(device, quick=False):
     with its results read by the host; host what set_poses, set_lods and intersect take for it; ratio host over
     frame_read.
     """
-    device = wp.get_device(device)
     sizes = QUICK if quick else FULL
     model = ab.Model.from_arrays(*knot(sizes["faces"]))
     levels = np.unique(np.linspace(model.lod_max // 10, model.lod_max, STEPS).astype(np.int32))
@@ -113,7 +112,7 @@ def run(device, quick=False):
         for ladder in (False, True) if device.is_cuda or count <= OBJECTS_MAX_CPU else ():
             gc.collect()  # scenes and their queries hold each other
             frames = Frames(scene_of_objects(device, model, grid_poses(count)), levels, ladder)
-            row = {"device": device.name, "faces": model.face_count, "objects": count, "ladder": ladder}
+            row = {"faces": model.face_count, "objects": count, "ladder": ladder}
             row |= frames.check(sizes["repeats"])
             runs = make_runs({"frame": frames.launch}, device)
             runs |= {"frame_read": time_call(frames.replay_and_read, device)}

@@ -1,13 +1,10 @@
 """Time to read results: `Scene.intersect` beside its launches, by output and size."""
 
-import gc
-
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 
-from ..shapes import KNOT_PAIRS, knot, knot_batches, pair_poses, scene_of_pairs
+from ..shapes import KNOT_PAIRS, knot_batches, scene_of_pairs
 from ..timing import make_runs, medians, time_call, time_rounds
 
 QUICK = {"faces": 300, "pairs": (1, 4), "distances": (0.2,), "repeats": 2}
@@ -26,15 +23,11 @@ def run(device, quick=False):
     for, with what the result says of each pair; goal_ms is launches and their transfer at 20 GB/s, ratio intersect over
     it.
     """
-    device = wp.get_device(device)
     sizes = QUICK if quick else KNOT_PAIRS
-    model = ab.Model.from_arrays(*knot(sizes["faces"]), name="knot")
-    for count, distance in knot_batches(device, sizes):
-        gc.collect()
-        scene, pairs = scene_of_pairs(device, model, pair_poses(count, distance))
+    for about, model, poses in knot_batches(device, sizes):
+        scene, pairs = scene_of_pairs(device, model, poses)
         for output in OUTPUTS:
-            row = {"device": device.name, "pairs": count, "distance": distance, "output": output}
-            yield row | time_output(device, scene, pairs, output, sizes["repeats"])
+            yield about | {"output": output} | time_output(device, scene, pairs, output, sizes["repeats"])
 
 
 def time_output(device, scene, pairs, output, repeats):

@@ -1,17 +1,15 @@
 """All intersecting face pairs of many posed pairs of one knot, beside wp.Bvh and Newton, where installed."""
 
-import gc
 import time
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 
 from ..baselines.newton import make_newton
 from ..baselines.wp_bvh import BvhPosed
 from ..memory import memory_columns
-from ..shapes import KNOT_PAIRS, knot, knot_batches, pair_poses, scene_of_pairs
+from ..shapes import KNOT_PAIRS, knot_batches, scene_of_pairs
 from ..timing import ratio_of, summarise, time_in_turn
 from ..verify import count_differences, judge_disputed
 
@@ -28,18 +26,14 @@ def run(device, quick=False):
     says how many face pairs on which the peer differs the exact oracle decided, ours_wrong in how many it sides with
     the peer. Memory is that of scene and query, before the baselines.
     """
-    device = wp.get_device(device)
     sizes = QUICK if quick else KNOT_PAIRS
-    mesh = knot(sizes["faces"])
-    model = ab.Model.from_arrays(*mesh, name=f"knot {len(mesh[1]):,}")
-    for pair_count, distance in knot_batches(device, sizes):
-        poses = pair_poses(pair_count, distance)
-        yield {"distance": distance} | run_batch(device, model, mesh, poses, sizes["repeats"])
+    for about, model, poses in knot_batches(device, sizes):
+        yield about | run_batch(device, model, poses, sizes["repeats"])
 
 
-def run_batch(device, model, mesh, poses, repeats):
+def run_batch(device, model, poses, repeats):
     """Return the row of one batch of pairs."""
-    gc.collect()  # scenes and their queries hold each other
+    mesh = model.mesh_at(model.lod_max)[:2]
     scene, pairs = scene_of_pairs(device, model, poses)
     begin = time.perf_counter()
     whole = scene.intersect(pairs, output="faces")
@@ -47,7 +41,7 @@ def run_batch(device, model, mesh, poses, repeats):
     query = ab.Query(scene, output="faces", pairs=pairs, capacity=max(1, len(whole.faces)))
     memory = memory_columns(scene, query)
     baseline = BvhPosed(*mesh, poses, 4 * len(whole.faces) + 1024, device)
-    row = {"device": device.name, "faces": len(mesh[1]), "pairs": len(pairs), "hits": len(whole.faces)}
+    row = {"faces": len(mesh[1]), "hits": len(whole.faces)}
     row |= {name: getattr(whole, name).sum(dtype=np.int64) for name in COUNTERS}
     row |= {"first_s": first, "peer": f"wp.Bvh {baseline.constructor}"}
     newton, skipped = {}, {"newton": "more pairs take minutes"}

@@ -4,7 +4,6 @@ import gc
 import time
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 
@@ -43,7 +42,6 @@ def run(device, quick=False, models=None):
     build_s is the time to make scene and query, first_s that of the first run, which compiles and grows buffers. Memory
     is that of scene and query, before there is a baseline. broad is the broad phase of worlds alone.
     """
-    device = wp.get_device(device)
     sizes = QUICK if quick else CUDA if device.is_cuda else CPU
     repeats, folder = sizes["repeats"], ModelFolder(models)
     model = folder.load([f"knot:{sizes['pairs']['faces']}"])
@@ -77,7 +75,7 @@ def make_query(device, model, poses, pairs=None, world_size=None):
     query = ab.Query(scene, "faces", pairs=pairs)
     made = time.perf_counter()
     result = query.run()
-    row = {"device": device.name, "faces": model.face_count, "pairs": len(result.pairs), "hits": len(result.faces)}
+    row = {"faces": model.face_count, "pairs": len(result.pairs), "hits": len(result.faces)}
     row |= {"build_s": made - begin, "first_s": time.perf_counter() - made}
     return scene, query, result, row | memory_columns(scene, query)
 

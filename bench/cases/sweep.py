@@ -4,8 +4,6 @@ The launch is that of a query over posed objects. `sweep` is timed as called, fr
 in float64 and float32 on the host, and in float32 on the device.
 """
 
-import gc
-
 import numpy as np
 import warp as wp
 
@@ -28,16 +26,14 @@ def run(device, quick=False):
     meet is the fraction of poses that intersect; million poses a second from medians. Memory is that of scene and
     query, before there is a baseline, whose answers are counted against ours; those of every `sweep` must be ours.
     """
-    device = wp.get_device(device)
     sizes = QUICK if quick else CPU if device.is_cpu else FULL
     knots = ab.Model.from_arrays(*knot(sizes["faces"]))
     real = real_meshes({"cow 5,804": ("cow",)})
     for name, (model,) in {f"knot {knots.face_count:,}": (knots,), **real}.items():
         for case, run_case, counts in (("launch", run_launch, "counts"), ("sweep", run_sweep, "sweep_counts")):
             for count in sizes[counts]:
-                gc.collect()  # scenes and their queries hold each other
                 poses = random_poses(longest_side(model), count)
-                about = {"device": device.name, "model": name, "case": case, "poses": count}
+                about = {"model": name, "case": case, "poses": count}
                 yield about | run_case(device, model, poses, sizes["repeats"])
 
 

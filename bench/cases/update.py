@@ -8,7 +8,6 @@ import copy
 import math
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 from warp_abtree import testing
@@ -36,7 +35,6 @@ def run(device, quick=False, models=None):
     repeats included; full tells whether the library would refit the whole tree. bvh_build boxes the faces at the LOD
     and builds a wp.Bvh over them.
     """
-    device = wp.get_device(device)
     sizes = QUICK if quick else CPU if device.is_cpu else FULL
     for face_target in sizes["faces"]:
         yield from run_mesh(device, knot_model(face_target, models), sizes)
@@ -93,7 +91,7 @@ def measure_update(scene, there, back, faces, repeats):
     device = scene.device
     k, nodes, entries, launches = check_update(scene, there, back, faces)
     bound = int(sum(bound_nodes(int(each), faces) for each in k))
-    row = {"device": device.name, "faces": faces, "states": len(k), "k": k.sum(), "entries": entries}
+    row = {"faces": faces, "states": len(k), "k": k.sum(), "entries": entries}
     row |= {"nodes_refitted": nodes.sum(), "bound": bound}
     ways = {(kind, way): launch for kind, both in launches.items() for way, launch in enumerate(both)}
     runs = make_runs(ways, device)

@@ -7,12 +7,13 @@ import time
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 
+from ..baselines.fcl import FclSlopes
 from ..baselines.warp_mesh import WarpMeshSlopes
-from ..timing import medians, one_core, time_call, time_rounds
+from ..shapes import pose_matrices
+from ..timing import host_clock, medians, one_core, time_call, time_rounds
 
 SAMPLE = Path(__file__).parents[2] / "scenes" / "07_place_without_overlap.py"
 WORLDS = 64
@@ -30,7 +31,6 @@ def run(device, quick=False):
     more than 1e-9, of float32 1e-4; agree is the share of near ones whose slopes along translations are within 1e-3, of
     float32 1e-2 (turns of things that stand upright have other slopes to either side).
     """
-    device = wp.get_device(device)
     with contextlib.redirect_stdout(io.StringIO()):
         sample = runpy.run_path(str(SAMPLE))
     models, size, margin = sample["models"], sample["size"], sample["margin"]
@@ -42,24 +42,18 @@ def run(device, quick=False):
     pairs = (np.stack(np.triu_indices(size, 1), 1) + size * np.arange(worlds)[:, None, None]).reshape(-1, 2)
     query = ab.DistanceQuery(scene, pairs, signed=True, beyond=margin)
 
-    def ask():
-        return query.run().gradient
-
-    found, clock = query.run(), time.thread_time if device.is_cpu else time.perf_counter
-    row = {"device": device.name, "worlds": worlds, "pairs": len(pairs), "faces": sum(m.face_count for m in models)}
+    found, clock = query.run(), host_clock(device)
+    row = {"worlds": worlds, "pairs": len(pairs), "faces": sum(m.face_count for m in models)}
     row |= {"overlapping": int(found.any.sum()), "near": int((found.distance < margin).sum())}
-    with one_core() if device.is_cpu else contextlib.nullcontext():
-        times = time_rounds({"ours": time_call(ask, device, clock)}, 3 if quick else 9)
+    with one_core(device):
+        times = time_rounds({"ours": time_call(lambda: query.run().gradient, device, clock)}, 3 if quick else 9)
     row |= {"ours_ms": medians(times)["ours"]}
-    matrices, meshes = np.tile(np.eye(4), (len(poses), 1, 1)), [m.mesh_at(m.lod_max)[:2] for m in models] * worlds
-    matrices[:, :3, 3] = poses[:, :3]
+    matrices, meshes = pose_matrices(poses), [m.mesh_at(m.lod_max)[:2] for m in models] * worlds
     with contextlib.suppress(ImportError):
-        from ..baselines.fcl import FclSlopes
-
         row |= compare("fcl", FclSlopes(meshes, matrices), pairs, margin, query, (1e-9, 1e-3), time.thread_time)
         row["ratio"] = round(row["fcl_ms"] / row["ours_ms"], 1)
     others = WarpMeshSlopes(meshes, matrices, device)
-    with one_core() if device.is_cpu else contextlib.nullcontext():
+    with one_core(device):
         row |= compare("warp", others, pairs, margin, query, (1e-4, 1e-2), clock)
     row["warp_ratio"] = round(row["warp_ms"] / row["ours_ms"], 1)
     yield row

@@ -9,17 +9,15 @@ on one core, in turn with the face pairs of that world.
 import time
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 
 from ..cases.assembly import rest_nuts
-from ..meshes import ModelFolder
+from ..meshes import NUT, ModelFolder
 from ..shapes import scene_of_poses
-from ..timing import make_runs, medians, one_core, ratio_of, time_in_turn, time_rounds
+from ..timing import medians, one_core, ratio_of, time_in_turn
 from .penetration import Contacts, near_contacts, penetration_allowed
 
-NUT = ("factory-bolt-m20", "factory-nut-m20")
 FULL = {"poses": 8, "worlds": {"cuda": 1024, "cpu": 8}, "repeats": 5}
 QUICK = {"poses": 2, "worlds": {"cuda": 2, "cpu": 2}, "repeats": 1}
 LODS = {"all faces": None, "10 um": 1e-5, "30 um": 3e-5}  # tolerance [m]
@@ -35,7 +33,6 @@ def run(device, quick=False, count=None, models=None):
     the like are penetration; worlds_ms is a launch over all worlds, one_ms over the first, faces_ms is
     `Query(scene, "faces")` of it and one_ratio one_ms over that.
     """
-    device = wp.get_device(device)
     sizes, folder = QUICK if quick else FULL, ModelFolder(models)
     missing = [name for name in NUT if not folder.has(name)]
     if missing:
@@ -52,7 +49,7 @@ def run(device, quick=False, count=None, models=None):
         scene.set_lods([lods[0]] + [lods[1]] * len(judged))
         near = scene.intersect(pairs, output="contacts", gap=GAP)
         for asked in ASKED:
-            row = {"device": device.name, "case": name, "faces": faces, "poses": len(judged)}
+            row = {"case": name, "faces": faces, "poses": len(judged)}
             found = ab.ManifoldQuery(scene, pairs, gap=GAP, points=asked).run()
             row |= judge(near, found) | {"asked": asked, "worlds": count}
             yield row | time_worlds(device, parts, lods, placed, asked, found, sizes["repeats"])
@@ -104,6 +101,6 @@ def time_worlds(device, models, lods, matrices, asked, found, repeats) -> dict:
     faces = ab.Query(scene, "faces", pairs=pairs[:1])
     one.run(), faces.run()
     with one_core():
-        times = time_rounds(make_runs({"one": one.launch, "faces": faces.launch}, device, time.thread_time), repeats)
+        times = time_in_turn({"one": one.launch, "faces": faces.launch}, device, repeats, time.thread_time)
     taken |= medians(times)
     return {f"{name}_ms": ms for name, ms in taken.items()} | {"one_ratio": ratio_of(times["one"], times["faces"])}

@@ -16,7 +16,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 
 ROOT = Path(__file__).resolve().parents[2]
 WORKER = Path(__file__).with_name("worker.py")
@@ -54,12 +53,11 @@ class Tree:
 def run(device, before=None, quick=False):
     """Yield a row a difference of bytes or kernels from another checkout, a row a launch, and a summary; without one
     the digests, times and kernels of this one. Raise a RuntimeError where it is no checkout, or a worker failed."""
-    device = wp.get_device(device)
     roots = {"now": ROOT} if before is None else {"before": Path(before).resolve(), "now": ROOT}
     for root in roots.values():
         if not (root / "warp_abtree" / "__init__.py").is_file():
             raise RuntimeError(f"{root} is no checkout of warp_abtree")
-    yield {"case": "trees"} | {name: revision(root) for name, root in roots.items()} | {"device": device.name}
+    yield {"case": "trees"} | {name: revision(root) for name, root in roots.items()}
     trees = {name: Tree(root, device.alias, quick) for name, root in roots.items()}
     try:
         differing = yield from compare_digests(trees, REGIMES["cuda" if device.is_cuda else "cpu"])

@@ -11,33 +11,29 @@ import time
 from collections import Counter
 
 import numpy as np
-import warp as wp
 
 import warp_abtree as ab
 from warp_abtree import testing
 
-from ..baselines import tight_inclusion
 from ..baselines.fcl import Fcl
 from ..cases.assembly import PITCH, place_nut, turned
-from ..meshes import ModelFolder, knot_model, mesh_file
+from ..meshes import NUT, ModelFolder, knot_model, mesh_file
 from ..shapes import longest_side, pose_matrices, random_directions, scene_of_poses
 from ..timing import medians, no_garbage_collection, one_core, time_in_turn
-from .ccd_queries import FOLDER, POINTS, read_queries
+from . import ccd_queries
 
 FULL = {"count": 65536, "checked": 1_000_000, "samples": 32, "repeats": 5, "turn": 10.0, "fcl": 0}
 CPU = FULL | {"count": 256, "checked": 20_000, "fcl": 8}
 HALF_REVOLUTION = 2.0**-16  # real part of a turn, under which there is none
 QUICK = {"count": 3, "checked": 20, "samples": 4, "repeats": 1, "turn": 0.01, "fcl": 1}
 TOLERANCE = 1e-6
-NUT = ("factory-bolt-m20", "factory-nut-m20")
 
 
 def run(device, count=None, quick=False):
     """Yield the rows; count is that of the checked motions."""
-    device = wp.get_device(device)
     sizes = dict(QUICK if quick else CPU if device.is_cpu else FULL)
     sizes["checked"] = count or sizes["checked"]
-    yield check_queries(device, tight_inclusion.AVAILABLE and device.is_cpu and not quick)
+    yield check_queries(device, ccd_queries.ipctk and device.is_cpu and not quick)
     folder = ModelFolder(None)
     at_hand = mesh_file("cow") and not quick
     name, model = ("cow", folder.load(["cow"])) if at_hand else ("knot", knot_model(300))
@@ -72,8 +68,8 @@ def random_motions(model, count, first, last, seed=0):
 def check_queries(device, baseline):
     """Return how public queries are answered, and by the baseline if asked, each in so many us a query."""
     counts, seconds = Counter(), Counter()
-    for number, path in enumerate(sorted(FOLDER.glob("*.csv.gz"))):
-        starts, ends, truth = read_queries(path)
+    for number, path in enumerate(sorted(ccd_queries.FOLDER.glob("*.csv.gz"))):
+        starts, ends, truth = ccd_queries.read_queries(path)
         if number == 0:
             testing.advance_corners(starts, ends, TOLERANCE, device)  # compiles
         began = time.perf_counter()
@@ -83,15 +79,15 @@ def check_queries(device, baseline):
         counts.update(missed=(truth & clear).sum(), beyond=(~truth & ~clear).sum())
         if baseline:
             kind = path.name.split(".")[1]
-            points = list(POINTS[kind])
+            points = list(ccd_queries.POINTS[kind])
             began = time.perf_counter()
-            hit = np.array(tight_inclusion.find_collisions(kind, starts[:, points], ends[:, points]))
+            hit = np.array(ccd_queries.find_collisions(kind, starts[:, points], ends[:, points]))
             seconds["tight_inclusion_us"] += time.perf_counter() - began
             counts.update(tight_inclusion_missed=(truth & ~hit).sum(), tight_inclusion_beyond=(~truth & hit).sum())
     if not counts["asked"]:
         return {"case": "queries", "skipped": "no files: set ABTREE_CCD to their folder"}
     taken = {name: 1e6 * value / counts["asked"] for name, value in seconds.items()}
-    return {"device": device.name, "case": "queries"} | counts | taken
+    return {"case": "queries"} | counts | taken
 
 
 def between(first, last, times):
@@ -118,7 +114,7 @@ def check_motions(name, model, device, sizes):
     touching = ~rows["clear"] & ~rows["undecided"] & (rows["time"] > 0)
     later = np.minimum(rows["time"] + TOLERANCE, 1)
     meets = ab.sweep(model, model, between(first, last, later), device=device)
-    row = {"device": device.name, "case": f"checked, {name}", "asked": len(rows), "clear": rows["clear"].sum()}
+    row = {"case": f"checked, {name}", "asked": len(rows), "clear": rows["clear"].sum()}
     row |= {"at_start": (rows["time"] == 0).sum(), "undecided": rows["undecided"].sum()}
     return row | {"late": late, "missed": missed, "early": (touching & ~meets).sum()}
 
@@ -129,7 +125,7 @@ def measure(name, models, poses, device, sizes):
     scene, pairs = scene_of_poses(device, *models, first)
     query = ab.FirstContactQuery(scene, np.concatenate([np.eye(4)[None], last]), pairs, tolerance=TOLERANCE)
     found = query.run()
-    row = {"device": device.name, "case": name, "motions": len(pairs)}
+    row = {"case": name, "motions": len(pairs)}
     row |= {"clear": found.clear.sum(), "at_start": (found.time == 0).sum(), "undecided": found.undecided.sum()}
     row |= {"node_tests": found.node_tests.mean(), "face_tests": found.triangle_tests.mean()}
     with one_core(), no_garbage_collection():

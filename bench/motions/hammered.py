@@ -8,9 +8,10 @@ import time
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 
 from warp_abtree.app import load_scene
+
+from ..timing import time_call
 
 SCENE = Path(__file__).resolve().parents[2] / "scenes" / "nut_and_bolt.toml"
 PITCH, WORLDS = 0.15, "worlds = 8"
@@ -34,18 +35,15 @@ def measure(worlds, device, steps=STEPS):
     nuts = np.flatnonzero([scene.models[k] is nut for k in scene.object_model])
     start = last = dynamics.poses()[nuts]
     turned, off, times = np.zeros(len(nuts)), np.zeros(len(nuts)), []
-    begin = time.perf_counter()
+    take_step, begin = time_call(lambda: dynamics.step(loaded.time_step), dynamics.device), time.perf_counter()
     while len(times) < steps and time.perf_counter() - begin < LIMIT_S:
-        at = time.perf_counter()
-        dynamics.step(loaded.time_step)
-        wp.synchronize_device(dynamics.device)
-        times.append(1e3 * (time.perf_counter() - at))
+        times.append(take_step())
         poses = dynamics.poses()[nuts]
         step = turns_about_z(poses) - turns_about_z(last)
         turned += (step + np.pi) % (2 * np.pi) - np.pi
         last = poses
         off = np.maximum(off, np.abs(poses[:, 2] - start[:, 2] - PITCH * turned / (2 * np.pi)))
     meet = scene.intersect(scene.broad_phase(), output="any").any
-    row = {"device": wp.get_device(device).name, "nuts": len(nuts), "steps": len(times)}
+    row = {"nuts": len(nuts), "steps": len(times)}
     row |= {"tunnelled": (off > PITCH / 2).sum(), "off_max": off.max(), "pitch": PITCH}
     return row | {"meet_at_end": meet.sum(), "step_ms": np.median(times), "step_max_ms": max(times)}

@@ -6,13 +6,11 @@ our own. Around it stand real meshes, joined to one of about 190,000 faces; with
 
 import os
 import tempfile
-import time
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import trimesh
-import warp as wp
 
 import warp_abtree as ab
 from warp_abtree.model.mesh import load_mesh
@@ -20,7 +18,7 @@ from warp_abtree.model.mesh import load_mesh
 from ..baselines.fcl import FclRobot
 from ..meshes import mesh_file
 from ..shapes import knot
-from ..timing import one_core, summarise, time_call, time_rounds
+from ..timing import host_clock, one_core, summarise, time_call, time_rounds
 
 FULL = {"count": 4096, "fcl": 512, "repeats": 7, "fine": 70}
 QUICK = {"count": 24, "fcl": 24, "repeats": 1, "fine": 12}
@@ -75,7 +73,7 @@ def run(device, quick=False, only=PARTS):
     On the CPU one thread works. Forward kinematics is part of our time, and none of python-fcl's, which asks pair by
     pair until two intersect. Answers that differ from its are counted.
     """
-    device, sizes = wp.get_device(device), QUICK if quick else FULL
+    sizes = QUICK if quick else FULL
     with tempfile.TemporaryDirectory() as folder:
         path = os.environ.get("ABTREE_ROBOT") or write_arm(Path(folder), sizes["fine"])
         robot = ab.Robot.load(path, "visual", device, mounted=["link0"])
@@ -83,10 +81,9 @@ def run(device, quick=False, only=PARTS):
     around = ab.Model.load(mesh, base_faces=len(mesh.faces))
     count, rng = sizes["count"] if device.is_cpu else 2**20, np.random.default_rng(0)
     configurations = rng.uniform(*robot.limits.T, (count, len(robot.joint_names)))
-    about = {"device": device.name, "robot_faces": sum(model.face_count for model in robot.models)}
+    about = {"robot_faces": sum(model.face_count for model in robot.models)}
     about |= {"world_faces": around.face_count, "self_pairs": len(robot.pairs)}
-    # One thread works: its own time leaves out other processes.
-    clock = time.thread_time if device.is_cpu else time.perf_counter
+    clock = host_clock(device)
     with one_core():
         if "any" in only:
             yield about | run_any(device, clock, robot, around, configurations, sizes)
@@ -94,7 +91,7 @@ def run(device, quick=False, only=PARTS):
             part = configurations[: max(2, count // 8)]
             for beyond in (None, 0.05):
                 ask = partial(robot.check, part, around, "distance", beyond)
-                yield about | {"output": "distance", "beyond": beyond} | time_once(device, clock, ask, part)
+                yield about | {"output": "distance", "beyond": beyond} | time_asked(device, clock, ask, part)
         if "edges" in only:
             # Between configurations that are free, a twentieth of the way to another.
             free = configurations[~robot.check(configurations, around)]
@@ -102,12 +99,13 @@ def run(device, quick=False, only=PARTS):
             ask = partial(robot.check_edges, starts, starts + 0.05 * (others - starts), around)
             rows = ask()
             row = {"output": "edges", "clear": rows["clear"].mean(), "undecided": rows["undecided"].mean()}
-            yield about | row | time_once(device, clock, ask, starts)
+            yield about | row | time_asked(device, clock, ask, starts)
 
 
-def time_once(device, clock, ask, asked):
-    """Return the columns of times of a question about configurations or edges."""
-    row = summarise(time_rounds({"ours": time_call(ask, device, clock)}, 1))
+def time_asked(device, clock, ask, asked, repeats=1, **others):
+    """Return the columns of times of a question about configurations or edges, and of others on the host."""
+    runs = {name: time_call(other, clock=clock) for name, other in others.items()}
+    row = summarise(time_rounds({"ours": time_call(ask, device, clock)} | runs, repeats))
     return {"asked": len(asked)} | row | {"per_s": round(1e3 * len(asked) / row["ours_ms"])}
 
 
@@ -115,12 +113,7 @@ def run_any(device, clock, robot, around, configurations, sizes):
     """Return the columns of yes or no, beside python-fcl."""
     fcl_robot, some = FclRobot(robot, around), configurations[: sizes["fcl"]]
     poses, found = robot.forward(some).numpy(), robot.check(configurations, around)
-    runs = {
-        "ours": time_call(lambda: robot.check(configurations, around), device, clock),
-        "fcl": time_call(lambda: fcl_robot.any(poses), clock=clock),
-    }
-    row = {"output": "any", "asked": len(configurations), "meet": found.mean()}
-    row["differ_from_fcl"] = (fcl_robot.any(poses) != found[: len(some)]).sum()
-    row |= summarise(time_rounds(runs, sizes["repeats"]))
-    per_s = {"per_s": round(1e3 * len(configurations) / row["ours_ms"])}
-    return row | per_s | {"fcl_per_s": round(1e3 * len(some) / row["fcl_ms"])}
+    ask, ask_fcl = partial(robot.check, configurations, around), partial(fcl_robot.any, poses)
+    row = {"output": "any", "meet": found.mean(), "differ_from_fcl": (ask_fcl() != found[: len(some)]).sum()}
+    row |= time_asked(device, clock, ask, configurations, sizes["repeats"], fcl=ask_fcl)
+    return row | {"fcl_per_s": round(1e3 * len(some) / row["fcl_ms"])}

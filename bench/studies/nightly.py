@@ -51,7 +51,7 @@ def measure(name, device, quick) -> dict:
     """Return the times [ms] of every series of a case, one a run."""
     case, series = importlib.import_module(f"bench.cases.{name}"), {}
     for _ in range(RUNS):
-        for row in case.run(device, quick=quick):
+        for row in case.run(wp.get_device(device), quick=quick):
             key = " ".join(f"{column}={row[column]}" for column in KEYS[name] if column in row)
             for column, value in row.items():
                 if not column.endswith("_ms") or column.endswith("_p95_ms") or column.startswith(OTHERS):

@@ -9,8 +9,4 @@ PARTS = {
     "static": static.run,
     "figure4": budget.run,
 }
-SUMMARIES = {
-    "fit_figure_6": update.fit_figure_6,
-    "fitted_moves": update.fitted_moves,
-    "thin": update.thin,
-}
+SUMMARIES = {function.__name__: function for function in (update.fit_figure_6, update.fitted_moves, update.thin)}

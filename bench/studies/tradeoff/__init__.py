@@ -2,19 +2,10 @@
 
 from functools import partial
 
-from . import competitors, distances, lods, motions, summaries
+from . import competitors, distances, lods, motions
+from .summaries import by_offset, choose, over_meshes, over_workloads, summarise
 
-PARTS = {
-    "lods": lods.run,
-    "competitors": competitors.run,
-    "distances": distances.run,
-    "motions": motions.run,
-}
-SUMMARIES = {
-    "over_meshes": summaries.over_meshes,
-    "choose": summaries.choose,
-    "by_offset": summaries.by_offset,
-    "over_workloads": summaries.over_workloads,
-    "distances": partial(summaries.summarise, names=("method", "setting", "where")),
-    "motions": partial(summaries.summarise, names=("method", "setting")),
-}
+PARTS = {part.__name__.rpartition(".")[2]: part.run for part in (lods, competitors, distances, motions)}
+SUMMARIES = {function.__name__: function for function in (over_meshes, choose, by_offset, over_workloads)}
+SUMMARIES["distances"] = partial(summarise, names=("method", "setting", "where"))
+SUMMARIES["motions"] = partial(summarise, names=("method", "setting"))

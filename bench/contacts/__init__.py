@@ -1,1 +1,0 @@
-"""Contact points of nuts on bolts, and the penetration that they allow."""

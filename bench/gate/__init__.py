@@ -1,1 +1,0 @@
-"""Two checkouts beside each other: `python -m bench gate`."""

@@ -1,1 +1,0 @@
-"""First contacts: public queries with ground truth, and the case `motion`."""
