@@ -72,3 +72,12 @@ def half_refitted_in_part():
     """Refit states in part up to half of their faces on every device, also where the whole costs less."""
     with testing.regime(full_refit={"cpu": 0.5, "cuda": 0.5}):
         yield
+
+
+@pytest.fixture(params=["threads", "warps"])
+def regime(request, device):
+    """Search as CPUs do, and by warps as GPUs do, a CPU both ways."""
+    if request.param == "threads" and device != "cpu":
+        pytest.skip("threads are the CPU's")
+    with testing.regime(warps=request.param == "warps"):
+        yield

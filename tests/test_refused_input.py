@@ -142,14 +142,6 @@ def test_a_summary_is_of_frames(device):
     assert frame.summary()["frames"] == 1 and clock.rates["query"] == 0
 
 
-@pytest.mark.parametrize("name", ["rows.csv", "rows.json"])
-def test_a_history_into_a_folder_that_is_not_there(tmp_path, name):
-    frame = ab.Frame(balls())
-    frame.step()
-    caught = refused(FileNotFoundError, None, frame.record, tmp_path / "missing" / name)
-    assert str(tmp_path / "missing" / name) in str(caught) and "partial" not in str(caught)
-
-
 @pytest.mark.parametrize("index", [4, 2**31, -(10**30)])
 @pytest.mark.parametrize("face", ["f 1 2 {}", "f 1 2 3 {}", "f {0}/1 2/1 3/1"])
 def test_an_index_of_obj_beyond_the_vertices(tmp_path, index, face):

@@ -26,15 +26,6 @@ from warp_abtree import testing
 NAMES = ("box", "small ball", "crumbs", "soup", "torus", "capsule", "lattice soup", "twins", "grid", "three", "one")
 
 
-@pytest.fixture(params=["threads", "warps"])
-def regime(request, device):
-    """Traverse as CPUs do, and as GPUs do, a CPU both ways."""
-    if request.param == "threads" and device != "cpu":
-        pytest.skip("threads are the CPU's")
-    with testing.regime(warps=request.param == "warps"):
-        yield
-
-
 def corners_of(model, lod):
     vertices, faces, ids = model.mesh_at(lod)
     return vertices[faces], ids

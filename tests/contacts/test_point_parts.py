@@ -7,21 +7,11 @@ import warp as wp
 from helpers.bodies import about, model_of
 
 import warp_abtree as ab
-from warp_abtree import testing
 from warp_abtree.query import point_parts
 
 GAP, SIDE = 0.06, 4
 BALL = model_of(trimesh.creation.icosphere(subdivisions=3, radius=0.52))
 RING = model_of(trimesh.creation.torus(0.4, 0.16))
-
-
-@pytest.fixture(params=["warps", "threads"])
-def regime(request, device):
-    """Search by warps, which list what is near; on the CPU also by threads, which do not."""
-    if request.param == "threads" and device != "cpu":
-        pytest.skip("threads are the CPU's")
-    with testing.regime(warps=request.param == "warps"):
-        yield
 
 
 def grid(device, solids=False):

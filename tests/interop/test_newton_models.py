@@ -294,22 +294,16 @@ def test_a_graph_matches(device, world):
         assert check_matches(rows(contacts), before).all()
 
 
-def test_without_memory_nothing_matches(device, world):
+@pytest.mark.parametrize("remember", [True, False])
+def test_without_memory_or_generations_nothing_matches(device, world, remember):
+    """Contacts of Newton 1.6, which Isaac Lab 3.0 asks for, have no generations."""
     model, state, _ = world
-    found = ab.NewtonContacts(model, remember=False)
-    assert found.contacts().rigid_contact_match_index is None
+    found = ab.NewtonContacts(model, remember=remember)
     contacts = newton.Contacts(200, 0, device=device, contact_matching=True)
-    for _ in range(2):
-        found.collide(state, contacts)
-        assert (rows(contacts)[2] == -1).all()
-
-
-def test_contacts_without_generations_do_not_match(world):
-    """As those of Newton 1.6, which Isaac Lab 3.0 asks for."""
-    model, state, _ = world
-    found = ab.NewtonContacts(model)
-    contacts = found.contacts()
-    del contacts.rigid_contact_match_generation
+    if remember:
+        del contacts.rigid_contact_match_generation
+    else:
+        assert found.contacts().rigid_contact_match_index is None
     for _ in range(2):
         found.collide(state, contacts)
         assert len(rows(contacts)[0]) > 0 and (rows(contacts)[2] == -1).all()

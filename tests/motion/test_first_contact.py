@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from helpers import refused
-from helpers.motions import ANSWERS, STILL, find, pose_matrices, random_motions, starts_of, to_bytes
+from helpers.motions import ANSWERS, STILL, find, random_motions, starts_of, to_bytes
 from helpers.questions import captured, in_a_row, pairs_of, scene_of
 from helpers.samples import random_poses, sample
 from helpers.scenes import scene_with
@@ -124,21 +124,6 @@ def test_screws_end_where_they_should_and_keep_their_distance_from_the_axis(devi
     ends = [[*-middle, 0, 0, 0, 1], way]
     straight, screw = (scene.first_contact([(0, 1)], ends, screw=screw) for screw in (False, True))
     assert screw.clear.all() and not straight.clear.any() and not straight.undecided.any()
-
-
-def test_common_motions_are_clear(device):
-    """Objects that move as one body, turning about a point far from both, keep their distance."""
-    rng = np.random.default_rng(9)
-    cases, _ = random_motions(rng, 20)
-    whole = random_poses(rng, 20, 5.0)
-    scene = scene_of(device, cases)
-    met = scene.intersect(pairs_of(cases)).any
-    starts = pose_matrices(starts_of(cases))
-    scene.set_poses(starts)
-    ends = np.repeat(pose_matrices(whole), 2, 0) @ starts
-    result = scene.first_contact(pairs_of(cases), ends, screw=True)
-    near = scene.intersect(pairs_of(cases), "distance").distance < 1e-3
-    np.testing.assert_array_equal(result.clear[~near], ~met[~near])
 
 
 @pytest.mark.parametrize("path", [{}, {"screw": True}, {"linear": True}], ids=["straight", "screw", "linear"])

@@ -255,10 +255,12 @@ def test_a_mounted_link_without_a_mesh_takes_those_fixed_to_it(device):
 def test_a_robot_is_copied_and_pickled(arm):
     rows = random_configurations(60, seed=8)
     arm.exclude_meeting(rows[np.flatnonzero(arm.check(rows))[0]])
+    arm.link_padding = {"fore": 0.02}
     expected = arm.check(rows, AROUND)
     for other in (copy.copy(arm), copy.deepcopy(arm), pickle.loads(pickle.dumps(arm))):
         np.testing.assert_array_equal(other.check(rows, AROUND), expected)
         assert other.pairs.tolist() == arm.pairs.tolist() and other.mounted == arm.mounted
+        assert other.link_padding == arm.link_padding
     for make in (copy.copy, copy.deepcopy, pickle.dumps):
         refused(TypeError, "this RobotQuery holds device memory", make, arm.query(AROUND, room=1))
 

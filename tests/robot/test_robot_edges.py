@@ -1,5 +1,6 @@
 """Edges of robots alone, in batches and against dense samples; the reach of a part against longer numbers."""
 
+import copy
 from functools import cache
 from itertools import product
 
@@ -65,8 +66,10 @@ def test_an_edge_alone_and_in_any_batch_has_the_same_bits(arms, device, seed, to
     check_never_late(arm, AROUND, starts, ends, alone, tolerance)
 
 
-def test_times_are_never_late_and_early_by_the_tolerance_at_most(arms, device, monkeypatch):
-    arm, (starts, ends) = arms(device), random_edges(40, 7)
+@pytest.mark.parametrize("padding", [{}, {"upper": 0.01, "fore": 0.02, "left": 0.03}], ids=["bare", "padded"])
+def test_times_are_never_late_and_early_by_the_tolerance_at_most(arms, device, monkeypatch, padding):
+    arm, (starts, ends) = copy.copy(arms(device)), random_edges(40, 7)
+    arm.link_padding = padding
     rows = arm.check_edges(starts, ends, AROUND, tolerance=2.0**-10)
     met = ~rows["clear"]
     assert 10 < met.sum() < 36 and 3 < (rows["time"] == 0).sum() and not rows["undecided"].any()

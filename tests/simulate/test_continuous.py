@@ -99,14 +99,6 @@ def test_a_heap_falls_and_comes_to_rest_without_more_energy(device):
     assert np.sort(np.abs(dynamics.velocities()[0]).max(1))[-2] < 0.5
 
 
-def test_a_body_rests_about_a_slop_above_the_floor(device):
-    dynamics = on_ground(device, (box(0.8, 0.6, 0.4), (0, 0, 0.5, *about((0, 0, 1), 0.3))), continuous=True)
-    run(dynamics, 60, 1 / 60)
-    slop = dynamics.bodies.bounding_radius.numpy()[1] / 512
-    assert 0.2 + 0.4 * slop < dynamics.poses()[1, 2] < 0.2 + 1.6 * slop
-    assert dynamics.certified.fraction.numpy()[1] == 1
-
-
 def test_bodies_that_overlap_at_first_are_not_stopped(device):
     """Where surfaces intersect already nothing is promised, and nothing freezes."""
     placed = (SHEET, (0, 0, 0, 0, 0, 0, 1), True), (BULLET, (0, 0, 0.001, 0, 0, 0, 1))
@@ -172,16 +164,17 @@ def test_what_is_undecided_waits_and_is_no_error(device):
     np.testing.assert_array_equal(dynamics.certified.fraction.numpy(), 0)
 
 
-@pytest.mark.parametrize("speed", [30.0, 1e3, 1e9])
+@pytest.mark.parametrize("speed", [0.0, 30.0, 1e3, 1e9])
 def test_a_body_that_strikes_the_floor_stays_there(device, speed):
-    """The impulse that stopped it is not what it rests by: little of it may lift the body in the next step."""
+    """About a slop above it: the impulse that stopped it is not what it rests by, and may lift it little later."""
     placed = box(0.8, 0.6, 0.4), (0, 0, 0.5, *about((0, 0, 1), 0.3))
     dynamics = on_ground(device, placed, velocity=(0, 0, -speed), continuous=True)
     slop = dynamics.bodies.bounding_radius.numpy()[1] / 512
-    for _ in range(12):
+    for step in range(60):
         dynamics.step(1 / 60)
-        assert dynamics.poses()[1, 2] < 0.2 + 2 * slop
-    assert np.abs(dynamics.velocities()[0][1]).max() < 0.01
+        assert dynamics.poses()[1, 2] < 0.2 + 2 * slop or (speed == 0 and step < 20)
+    assert 0.2 + 0.4 * slop < dynamics.poses()[1, 2] < 0.2 + 1.6 * slop
+    assert np.abs(dynamics.velocities()[0][1]).max() < 0.01 and dynamics.certified.fraction.numpy()[1] == 1
 
 
 BOX = model_of(trimesh.creation.box((0.8, 0.6, 0.4)))

@@ -289,23 +289,18 @@ def test_no_moving_body_is_twice_in_a_color(device, seed):
     assert degree <= len(set(color.tolist())) <= degree + 2 and (color == COLORS).mean() < 0.01
 
 
-def test_motion_in_a_straight_line():
-    motion = ab.Kinematic(position=[[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]], velocity=[[1.0, 0.0, -2.0], [0.0, 0.5, 0.0]])
-    assert np.allclose(motion.poses(4.0), [[5, 2, -5, 0, 0, 0, 1], [0, 2, 0, 0, 0, 0, 1]])
-    assert np.allclose(motion.poses(-1.0)[:, :3], [[0, 2, 5], [0, -0.5, 0]])
-
-
-def test_rotation_about_an_axis():
+def test_motion_in_a_straight_line_and_about_an_axis():
     rng = np.random.default_rng(1)
     axis, rate = rng.normal(size=(8, 3)), rng.uniform(-3, 3, 8)
     start = rng.normal(size=(8, 4))
     start /= np.linalg.norm(start, axis=1, keepdims=True)
-    motion = ab.Kinematic(position=np.zeros((8, 3)), rotation=start, axis=axis, rate=rate)
+    motion = ab.Kinematic(position=np.ones((8, 3)), velocity=axis, rotation=start, axis=axis, rate=rate)
     buffer = np.empty((8, 7))
     for time in (0.0, 0.3, 7.7, -2.0):
         poses = motion.poses(time)
         assert motion.poses(time, out=buffer) is buffer and np.array_equal(buffer, poses)
         assert np.allclose(np.linalg.norm(poses[:, 3:], axis=1), 1.0, atol=1e-15)
+        np.testing.assert_allclose(poses[:, :3], 1 + time * axis, rtol=1e-15, atol=1e-15)
         for i in range(8):
             expected = rotation_matrix(rate[i] * time, axis[i]) @ quaternion_matrix(np.roll(start[i], 1))
             assert np.allclose(quaternion_matrix(np.roll(poses[i, 3:], 1)), expected, atol=1e-12)
