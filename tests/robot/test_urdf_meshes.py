@@ -72,6 +72,14 @@ def test_collada_is_scaled_to_meters(name, unit, meters, tmp_path):
     np.testing.assert_allclose(mesh_of(ab.Model.load(tmp_path / name)).bounds, BOX.bounds, rtol=1e-6)
 
 
+@pytest.mark.parametrize("scale", ["1 1 1", "1 1 -1"])
+def test_collada_nodes_may_be_mirrored(scale, tmp_path):
+    write_dae(tmp_path / "part.dae", '<unit meter="0.5"/>', "<matrix>-2 0 0 3  0 1 0 0  0 0 1 0  0 0 0 1</matrix>")
+    found = load(tmp_path, "part.dae", f'scale="{scale}"')
+    np.testing.assert_allclose(found.bounds, [[-1, -0.25, -0.75], [0, 0.75, 0.75]], atol=1e-6)
+    np.testing.assert_allclose(found.volume, 12 / 8, rtol=1e-6)
+
+
 @pytest.mark.parametrize("unit", ["0", "-1", "nan", "inf", "inch"])
 def test_units_that_are_none_are_refused(unit, tmp_path):
     write_dae(tmp_path / "part.dae", f'<unit meter="{unit}"/>')
