@@ -11,7 +11,7 @@ from warp_abtree.kernels.base.poses import HALF
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, ONE, ZERO, Bodies
 from warp_abtree.kernels.bodies.constraints import SLOP, Constraints, velocity_at
 from warp_abtree.kernels.contacts.manifold import Manifolds
-from warp_abtree.kernels.triangle.distance import power_below
+from warp_abtree.kernels.triangle.distance import largest_coordinate, power_below
 
 wp.set_module_options(native.options("base/lanes.cuh"))
 
@@ -46,7 +46,7 @@ class Units:
 
     length: wp.float64  # about the smaller bounding radius [world units]
     per_length: wp.float64  # 1 over it
-    per_speed: wp.float64  # 1 over the speed of about a slop a substep [s/world units]
+    per_speed: wp.float64  # 1 over the speed of about a slop a substep, or that of both [s/world units]
     mass: wp.float64  # about that of the lighter object
     impulse: wp.float64  # mass times speed
 
@@ -104,7 +104,8 @@ def make_units(per_substep: wp.float64, slop: wp.float64, pair: wp.vec2i, bodies
     units = Units()
     units.length = power_below(slop / SLOP)
     units.per_length = ONE / units.length
-    speed = power_below(slop * per_substep)
+    fastest = largest_coordinate(bodies.velocity[pair[1]] - bodies.velocity[pair[0]])
+    speed = power_below(wp.max(slop * per_substep, fastest))
     units.per_speed = ONE / speed
     units.mass = power_below(ONE / (dynamic_part(bodies, pair[0]) + dynamic_part(bodies, pair[1])))
     units.impulse = units.mass * speed
