@@ -37,6 +37,17 @@ def touching_faces(objects: ObjectPool, pair: FacePair, scale: wp.float64) -> wp
     """Return 1 where the second face lies in front of the first one, plus 2 where the first lies in front of it."""
 
 
+@native.func_native()
+def find_along_edges(
+    objects: ObjectPool, pair: FacePair, way: wp.vec3d, separation: wp.float64, w: wp.int32, witnesses: Witnesses
+) -> bool:
+    """Write the ends of what two edges share as candidates, where they are parallel; return whether they are.
+
+    Args:
+        way: Direction of the distance.
+    """
+
+
 @wp.func
 def which_touches(w: wp.int32, trees: Trees, own: PairObjects, pose: PairPose, pair: FacePair, near: Contacts):
     """Return which face of a contact touches the other one, which lies in front of it: 1, the first, 2, or 0.
@@ -58,7 +69,7 @@ def which_touches(w: wp.int32, trees: Trees, own: PairObjects, pose: PairPose, p
 def write_nearest_points(
     w: wp.int32,
     objects: ObjectPool,
-    a: wp.int32,
+    pair: FacePair,
     pose: PairPose,
     touching: wp.int32,
     contacts: Contacts,
@@ -66,13 +77,13 @@ def write_nearest_points(
 ):
     """Write the middle of the nearest points of a contact as its candidate, where both faces look at one another.
 
-    The normal is the direction of the distance; where faces touch, that of the face that has the other in front.
+    Of parallel edges, both ends of what they share. The normal is the direction of the distance; where faces touch,
+    that of the face that has the other in front.
 
     Args:
-        a: Object in whose frame the pose is.
         touching: As `which_touches`.
     """
-    rotation, position = objects.rotation[a], objects.position[a]
+    rotation, position = objects.rotation[pair.object], objects.position[pair.object]
     back = wp.transpose(rotation)
     n = wp.vec3d(contacts.normal[w])
     if touching == 1 and wp.dot(n, contacts.normal_a[w]) < ALONG:
@@ -80,11 +91,15 @@ def write_nearest_points(
     if touching == 2 and -wp.dot(n, contacts.normal_b[w]) < ALONG:
         n = -contacts.normal_b[w]
     ahead = wp.dot(n, contacts.normal_a[w]) > LEAST_AHEAD and wp.dot(n, contacts.normal_b[w]) < -LEAST_AHEAD
-    for k in range(COLUMN_CORNERS):
-        witnesses.depth[w, k] = NO_POINT
+    shared = bool(False)
     witnesses.normal[w] = n
+    witnesses.nearest_only[w] = wp.where(ahead, 1, 0)
     if ahead:
-        witnesses.nearest_only[w] = 1
+        shared = find_along_edges(objects, pair, n, contacts.separation[w], w, witnesses)
+    if not shared:
+        for k in range(COLUMN_CORNERS):
+            witnesses.depth[w, k] = NO_POINT
+    if ahead and not shared:
         first = back * (contacts.p0[w] - position) * pose.scale
         middle = (first + back * (contacts.p1[w] - position) * pose.scale) * (wp.float64(0.5) / pose.scale)
         witnesses.depth[w, 0] = -contacts.separation[w]
@@ -97,14 +112,18 @@ def find_facing(
     pair: FacePair,
     gap: wp.float64,
     separation: wp.float64,
-    touching: wp.int32,
+    side: wp.int32,
     w: wp.int32,
     witnesses: Witnesses,
 ) -> bool:
     """Write the corners of the column of faces that look at one another as candidates; return whether they serve.
 
-    Along the normal of either face, whichever leaves the wider gap, if that is the distance; where faces touch, that of
-    the face that has the other in front. A face that lies behind the other one's plane is inside, as deep as it is far.
+    Along the normal of either face, whichever leaves the wider gap, if that is the distance. A face that lies behind
+    the other one's plane is inside, as deep as it is far.
+
+    Args:
+        side: 1 or 2 for the normal of the first face or of the second alone: that of a face that an edge or a corner
+            of the other one stands over, or touches.
     """
 
 
@@ -120,7 +139,8 @@ def find_near_witness_kernel(
 ):
     """Find the contact of one witness of faces that are apart a thread, its normal and its candidate points.
 
-    Where both faces look at one another and the distance may be along the normal of either, corners of columns; else
+    Where both faces look at one another and the distance may be along the normal of either, corners of columns. Where
+    an edge or a corner of one stands over the other, or on it, along the normal of that, corners of its column. Else
     the nearest points, where neither face looks away from the other. A gap along a normal is that of two points of
     faces, which are convex: points farther apart than the nearest by a fraction e at most are so in a direction whose
     cosine with that of the distance is at least 1 / (1 + e).
@@ -140,7 +160,6 @@ def find_near_witness_kernel(
     own = contact_objects(batch, p)
     write_near_contact(w, trees, own, pose, item, contacts_out)
     n, normal_a, normal_b = contacts_out.normal[w], contacts_out.normal_a[w], contacts_out.normal_b[w]
-    along = wp.max(wp.abs(wp.dot(n, normal_a)), wp.abs(wp.dot(n, normal_b)))
     # Of what touches rounding may tell the direction.
     served, touch = bool(False), contacts_out.separation[w] * pose.scale < NO_DISTANCE
     pair = load_pair(trees, pose, own.a, item, normal_a, normal_b)
@@ -149,8 +168,20 @@ def find_near_witness_kernel(
         for k in range(COLUMN_CORNERS):
             witnesses_out.depth[w, k] = NO_POINT
         served = bool(True)
-    elif -wp.dot(normal_a, normal_b) >= OPPOSED_LEAST and (along >= ALONG or touch):
-        separation = contacts_out.separation[w]
-        served = find_facing(trees.objects, pair, gap[p], separation, touching, w, witnesses_out)
+    else:
+        opposed, separation = -wp.dot(normal_a, normal_b), contacts_out.separation[w]
+        ahead_a, ahead_b = wp.dot(n, normal_a), -wp.dot(n, normal_b)
+        facing = opposed >= OPPOSED_LEAST and (wp.max(wp.abs(ahead_a), wp.abs(ahead_b)) >= ALONG or touch)
+        side = wp.int32(touching)
+        if not touch and (ahead_a >= ALONG) != (ahead_b >= ALONG):
+            side = wp.where(ahead_a >= ALONG, 1, 2)
+        k, last = wp.where(facing, 0, 1), wp.where(side != 0 and opposed > LEAST_AHEAD, 1, 0)
+        while k <= last and not served:
+            served = find_facing(
+                trees.objects, pair, gap[p], separation, wp.where(k == 0, touching, side), w, witnesses_out
+            )
+            if served and k == 1 and not touch:
+                witnesses_out.nearest_only[w] = 1
+            k += 1
     if not served:
-        write_nearest_points(w, trees.objects, own.a, pose, touching, contacts_out, witnesses_out)
+        write_nearest_points(w, trees.objects, pair, pose, touching, contacts_out, witnesses_out)

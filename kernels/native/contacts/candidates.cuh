@@ -21,8 +21,14 @@ struct CandidateWriter {
     }
     CUDA_CALLABLE void write_corners(const C::Column& column) {
         column.visit(*this);
-        for (; place < COLUMN_CORNERS; ++place)
-            witnesses.depth.data[(wp::int64)COLUMN_CORNERS * w + place] = NAN;
+        fill_corners(INFINITY);
+    }
+    // Says that there are no more; none is deeper.
+    CUDA_CALLABLE void fill_corners(double most) const {
+        for (int k = 0; k < COLUMN_CORNERS; ++k) {
+            double& depth = witnesses.depth.data[(wp::int64)COLUMN_CORNERS * w + k];
+            depth = k < place ? C::lesser(depth, most) : NAN;
+        }
     }
     CUDA_CALLABLE void offer(const C::Point& point, double depth, bool exists) {
         if (!exists || depth < least - slack || place == COLUMN_CORNERS)
@@ -55,7 +61,7 @@ CUDA_CALLABLE wp::int32 touching_faces(const Objects& objects, const Pair& pair,
 
 template <class Objects, class Pair, class Witnesses>
 CUDA_CALLABLE bool find_facing(const Objects& objects, const Pair& pair, wp::float64 gap, wp::float64 separation,
-                               wp::int32 touching, wp::int32 w, const Witnesses& witnesses) {
+                               wp::int32 side, wp::int32 w, const Witnesses& witnesses) {
     typedef OneCrossing C;
     const C::Faces faces = faces_of(pair);
     const auto& rotation = objects.rotation.data[pair.object].data;
@@ -65,8 +71,8 @@ CUDA_CALLABLE bool find_facing(const Objects& objects, const Pair& pair, wp::flo
     C::Measured best = {normal_a, C::no_depth(), 0.0};
     // A gap wider than the distance stays so whatever the other normal says.
 #pragma unroll 1
-    for (int k = touching == 2; k < 2 && (best.depth == C::no_depth() || -best.depth - separation <= slack); ++k) {
-        if (k == 1 && touching == 1)
+    for (int k = side == 2; k < 2 && (best.depth == C::no_depth() || -best.depth - separation <= slack); ++k) {
+        if (k == 1 && side == 1)
             break;
         const C::Point n = C::choose(k == 0, normal_a, C::negate(normal_b));
         const C::Measured found = C::measure(faces, n, normal_a, normal_b, -gap);
@@ -81,4 +87,26 @@ CUDA_CALLABLE bool find_facing(const Objects& objects, const Pair& pair, wp::flo
         writer.write_corners(C::Column(faces, best.normal, normal_a, normal_b));
     }
     return serves;
+}
+
+template <class Objects, class Pair, class Witnesses>
+CUDA_CALLABLE bool find_along_edges(const Objects& objects, const Pair& pair, wp::vec3d way, wp::float64 separation,
+                                    wp::int32 w, const Witnesses& witnesses) {
+    typedef OneCrossing C;
+    const C::Faces faces = faces_of(pair);
+    const auto& rotation = objects.rotation.data[pair.object].data;
+    const C::Column column(faces, C::turn_back(rotation, point_of(way)),
+                           C::turn_back(rotation, point_of(pair.normal_a)),
+                           C::turn_back(rotation, point_of(pair.normal_b)));
+    const double rounding = C::find_slack(faces), least = -separation - C::greater(ALIKE * separation, rounding);
+    CandidateWriter<Objects, Witnesses> writer = {objects, witnesses, pair.object, w, least, 0.0, 0};
+    if (!column.looks)
+        return false;
+    column.visit(writer);
+    const wp::vec3d* const found = witnesses.point.data + (wp::int64)COLUMN_CORNERS * w;
+    bool shared = false;
+    for (int k = 1; k < writer.place; ++k)
+        shared |= wp::length(found[k] - found[0]) > rounding * (ALIKE / COLUMN_ROUNDING);
+    writer.fill_corners(-separation);
+    return shared;
 }

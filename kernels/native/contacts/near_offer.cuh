@@ -1,6 +1,7 @@
 // Offers of faces that are apart to slots: of one pair in each thread of a GPU, of 16 on the CPU.
 #pragma once
 #include "builtin.h"
+#include "contacts/edge_offer.cuh"
 #include "contacts/slots.cuh"
 #include "distance/faces32.h"
 
@@ -8,6 +9,8 @@
 constexpr float LOOKS_AT = -0.5f;
 // Farther than any point.
 constexpr float FAR_AWAY = 0x1p60f;
+// Faces look away from one another whose normals have no lower product than this, negative.
+constexpr float LOOKS_AWAY = -0x1p-10f;
 // Of the smaller object's size: of parallel faces that are no smaller it counts where their edges cross.
 constexpr float LARGE_FACE = 0x1p-3f;
 
@@ -67,28 +70,12 @@ struct NearOffer {
     static CUDA_CALLABLE lanes face_size(const Point (&c)[3]) {
         return N::most(N::largest(F::minus(c[1], c[0])), N::largest(F::minus(c[2], c[0])));
     }
-    // Rates the points over one another of edges that cross, seen along a normal: corners of what faces share.
-    static CUDA_CALLABLE void offer_crossings(N::Corners c, const Point& normal, float gap, float weight,
-                                              const lanes& slack, const bits& counts, Scores& scores) {
-        lanes s;
-        // One edge of A after the other, so that a GPU needs no stack.
-#pragma unroll 1
-        for (int i = 0; i < 3; ++i) {
-            const Point e = F::minus(c.a[1], c.a[0]);
-            for (int j = 0; j < 3; ++j) {
-                const Point f = F::minus(c.b[(j + 1) % 3], c.b[j]);
-                const Point v = N::between_edges(F::minus(c.b[j], c.a[0]), e, f, N::invert(F::dot(e, e)),
-                                                 N::invert(F::dot(f, f)), s);
-                const lanes height = F::dot(v, normal), square = height * height;
-                const bits over = F::dot(v, v) <= F::fuse(square, lanes{} + (1.0f + 0x1p-6f), slack * slack);
-                const bits near = (height <= gap) & (height >= -gap);
-                scores.offer(weight, vector_of(N::add(c.a[0], s, e)), height, counts & over & near);
-            }
-            const Point first = c.a[0];
-            c.a[0] = c.a[1];
-            c.a[1] = c.a[2];
-            c.a[2] = first;
-        }
+    // Whether a face lies in front of a plane.
+    static CUDA_CALLABLE bits is_ahead(const Point (&c)[3], const Point& of, const Point& normal, const lanes& size) {
+        lanes lowest = F::dot(F::minus(c[0], of), normal);
+        for (int k = 1; k < 3; ++k)
+            lowest = N::least(lowest, F::dot(F::minus(c[k], of), normal));
+        return lowest >= size * -0x1p-20f;
     }
     static CUDA_CALLABLE Scores rate(const N::Corners& c, float gap, float weight, const float* directions) {
         const lanes zero = {};
@@ -100,42 +87,63 @@ struct NearOffer {
         joined.count = 0;
         const lanes size = N::visit(c, joined), distance = F::root(joined.square);
         const lanes ahead_a = F::dot(joined.way, joined.normal_a), ahead_b = -F::dot(joined.way, joined.normal_b);
-        const bits facing = F::dot(joined.normal_a, joined.normal_b) <= LOOKS_AT;
+        const lanes product = F::dot(joined.normal_a, joined.normal_b);
+        const bits facing = product <= LOOKS_AT;
         // Along a normal, or so near that normals tell the direction.
+        const lanes least = distance * 0x1p-6f, straight = distance * 0.99f;
         const lanes most = N::most(F::absolute(ahead_a), F::absolute(ahead_b));
-        const bits touches = distance <= size * 0x1p-20f, column = facing & (touches | (most >= distance * 0.99f));
-        const bits along = column | touches,
+        const bits touches = distance <= size * 0x1p-20f, column = facing & (touches | (most >= straight));
+        // An edge or a corner that stands over the other face, and not along it.
+        const bits tilted = (product < LOOKS_AWAY) & (product > (float)-ALONG),
+                   ahead = (ahead_a > least) & (ahead_b > least);
+        bits over_a = tilted & ahead & (ahead_a >= straight), over_b = tilted & ahead & (ahead_b >= straight);
+        if (F::any(tilted & touches)) {
+            over_a = touches ? tilted & is_ahead(c.b, c.a[0], joined.normal_a, size) : over_a;
+            over_b = touches ? tilted & is_ahead(c.a, c.b[0], joined.normal_b, size) : over_b;
+        }
+        over_b = over_a ? bits{} : over_b;
+        const bits along = column | touches | over_a | over_b,
                    inside = column & (distance > size * 0x1p-20f) & (ahead_a < 0.0f) & (ahead_b < 0.0f);
-        const lanes separation = inside ? -distance : distance, least = distance * 0x1p-6f;
+        const lanes separation = inside ? -distance : distance;
         // What lies deeper inside than its distance is not measured by it (`near_points`).
         lanes lowest = zero;
         for (int k = 0; k < 6; ++k)
             lowest = joined.height[k] < lowest ? joined.height[k] : lowest;
         const bits fits = (separation >= 0.0f) | (-lowest <= distance * (1.0f + 0x1p-10f) + size * 0x1p-20f);
-        const bits counts = (distance <= gap) & fits & (along | ((ahead_a > least) & (ahead_b > least)));
+        const bits counts = (distance <= gap) & fits & (along | ahead);
         if (!F::any(counts)) {
             Scores none;
             none.inside = counts;
             none.counts = counts;
             return none;
         }
-        const Point n = F::choose(along, F::minus(joined.normal_a, joined.normal_b), joined.way);
+        // Faces that look at one another keep the mean: their slots then have more to choose from.
+        const Point down = F::minus(Point{}, joined.normal_b), mean = F::minus(joined.normal_a, joined.normal_b);
+        const bits takes_mean = along & (facing | ((over_a | over_b) == 0));
+        const Point n =
+            F::choose(takes_mean, mean, F::choose(over_a, joined.normal_a, F::choose(over_b, down, joined.way)));
         Scores scores(vector_of(n), directions);
         scores.inside = inside;
         scores.counts = counts;
+        const bits shared = column & (separation >= 0.0f);
+        const bits large = N::least(face_size(c.a), face_size(c.b)) * weight >= LARGE_FACE * gap;
+        const bits of_a = shared | (over_b & large), of_b = shared | (over_a & large);
         // What touches beside a column, perhaps looking away, goes behind all that is in one.
-        const lanes rank = column ? separation : separation + (along ? zero + gap : zero);
+        const lanes rank = touches & ((column | over_a | over_b) == 0) ? separation + gap : separation;
         scores.offer(weight, vector_of(N::add(joined.at, zero + 0.5f, joined.way)), rank, counts);
         for (int k = 0; k < 6; ++k) {
             const bits near = (joined.height[k] <= gap) & (joined.height[k] >= -gap);
-            scores.offer(weight, vector_of(joined.corner[k]), joined.height[k],
-                         counts & column & (separation >= 0.0f) & near);
+            scores.offer(weight, vector_of(joined.corner[k]), joined.height[k], counts & (k % 2 ? of_a : of_b) & near);
         }
-        const lanes smaller = N::least(face_size(c.a), face_size(c.b));
-        const bits large = counts & column & (separation >= 0.0f) & (smaller * weight >= LARGE_FACE * gap) &
-                           (F::dot(joined.normal_a, joined.normal_b) <= (float)-ALONG);
-        if (F::any(large))
-            offer_crossings(c, joined.normal_a, gap, weight, size * 0x1p-20f, large, scores);
+        const bits over = counts & large & ((shared & (product <= (float)-ALONG)) | over_a | over_b),
+                   edges = counts & large & (along == 0);
+        const lanes slack = size * 0x1p-20f;
+        if (F::any(over)) {
+            const Point up = F::choose(over_b, down, joined.normal_a);
+            EdgeOffer<Scores>::offer_crossings(c, up, gap, weight, slack, over, scores);
+        }
+        if (F::any(edges))
+            EdgeOffer<Scores>::offer_ends(c, weight, distance * (1.0f + 0x1p-10f) + slack, edges, scores);
         return scores;
     }
     // Where the slots are that scores belong in, and how many: of what is inside the deepest alone.
