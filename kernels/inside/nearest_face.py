@@ -78,6 +78,8 @@ def open_node(
 ):
     """Find the squared distances of a point from the boxes of a node's children, and what these stand for.
 
+    On CUDA they are rounded down.
+
     Args:
         start: Where the tree begins in the pool.
         node: In its tree.

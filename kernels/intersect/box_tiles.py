@@ -109,6 +109,7 @@ def find_columns(
     """Find the pairs of some objects of a tile, a bit each, with those behind them in another, one a lane."""
     column = load_tile_object(tile, filter, tiles, boxes)
     in_order, lane = tiles.meets.shape[0] > 0, warp_lane()
+    is_row = ((rows >> wp.uint32(lane)) & wp.uint32(1)) != wp.uint32(0)
     word, count = wp.int32(0), wp.int32(0)
     is_column = column.place < boxes.lower.shape[0]
     while rows != wp.uint32(0):
@@ -132,7 +133,7 @@ def find_columns(
                 slot = reserve_slot(boxes.pair_count, meets)
                 if meets:
                     write_pair(slot, i, column.object, pairs)
-    if in_order:
+    if in_order and is_row:
         tiles.meets[warp_size() * task + lane] = word
         if count > 0:
             wp.atomic_add(boxes.first_count, own.object, count)
@@ -141,6 +142,7 @@ def find_columns(
 
 @wp.kernel
 def find_tile_pair_kernel(
+    parts: wp.int32,
     tasks: wp.array(dtype=wp.vec3i),
     filter: PairFilter,
     tiles: Tiles,
@@ -148,12 +150,14 @@ def find_tile_pair_kernel(
     boxes_inout: PosedBounds,
     pairs_out: wp.array(dtype=wp.vec2i),
 ):
-    """Find the pairs of a tile with so many others by a warp; where they are listed in order, with one.
+    """Find the pairs of a tile with so many others by some warps; where they are listed in order, with one.
 
     Args:
+        parts: Warps that share the objects of the tile.
         tasks: A tile, the first of the others, none before it, and how many these are.
     """
-    place = wp.tid() / warp_size()
+    warp = wp.tid() / warp_size()
+    place, part = warp / parts, warp % parts
     task = tasks[place]
     if hold_uniform(boxes_inout.pair_count[0]) < 0:
         return
@@ -169,7 +173,7 @@ def find_tile_pair_kernel(
         while others != wp.uint32(0):
             tile = task[1] + first + lowest_bit(wp.int32(others))
             others = drop_lowest_bit(others)
-            is_row = own.place < boxes_inout.lower.shape[0]
+            is_row = own.place < boxes_inout.lower.shape[0] and lane % parts == part
             if is_row and with_boxes:
                 is_row = bounds_meet(own.lower, own.upper, tiles.lower[tile], tiles.upper[tile])
             find_columns(own, vote_lanes(is_row), place, tile, filter, tiles, objects, boxes_inout, pairs_out)

@@ -23,6 +23,8 @@ from warp_abtree.state.generation import LaunchGuard
 EVERY_WORLD = -1
 # Tasks of warps at most, of sorted objects, but for what their number needs.
 SORTED_TASKS = 2**20
+# Warps share the objects of a tile where there are no more tasks: each waits for one object after the other.
+SHARED_TASKS, SHARING_WARPS = 2**14, 4
 # Launches before the sort: boxes, their bounds, and keys.
 SORT_AFTER = 3
 
@@ -137,8 +139,9 @@ class TileSearch:
             dim = self._lanes * self._tile_count
             made.append(launch(box_tiles.bound_tile_kernel, dim=dim, inputs=[found.bounds, self.tiles], **warps))
         pool = found.batch.objects.pool
-        inputs = [self._tasks, found.filter, self.tiles, pool, found.bounds, found.pairs]
-        dim = self._lanes * len(self._tasks)
+        parts = SHARING_WARPS if self._lanes > 1 and len(self._tasks) <= SHARED_TASKS else 1
+        inputs = [parts, self._tasks, found.filter, self.tiles, pool, found.bounds, found.pairs]
+        dim = self._lanes * parts * len(self._tasks)
         made.append(launch(box_tiles.find_tile_pair_kernel, dim=dim, inputs=inputs, **warps))
         if self.in_order:
             inputs = [self._tasks, self.tiles, found.bounds, found.pairs, found.key]

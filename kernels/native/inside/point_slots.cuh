@@ -75,14 +75,8 @@ inline CUDA_CALLABLE void bound_children_of_slot(wp::array_t<wp::vec4> boxes, wp
     const float above[3] = {slots.above[0][slot], slots.above[1][slot], slots.above[2][slot]};
     for (int k = 0; k < 2; ++k) {
         const float4 low = records[2 * k], high = records[2 * k + 1];
-        const float lower[3] = {low.x, low.y, low.z}, upper[3] = {high.x, high.y, high.z};
-        float total = 0.0f;
-        for (int i = 0; i < 3; ++i) {
-            const float gap = fmaxf(fmaxf(__fsub_rd(lower[i], above[i]), __fsub_rd(below[i], upper[i])), 0.0f);
-            total = __fmaf_rd(gap, gap, total);
-        }
         const int skip = __float_as_int(low.w), face = __float_as_int(high.w);
-        bounds[k] = skip < 0 ? INFINITY : total;
+        bounds[k] = skip < 0 ? INFINITY : square_below(low, high, below, above);
         codes[k] = face >= 0 ? ~face : skip;
     }
 #else
