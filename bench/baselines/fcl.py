@@ -179,18 +179,15 @@ class Trimesh:
         self.a.add_object("a", trimesh.Trimesh(*a, process=False))
         self.b.add_object("b", trimesh.Trimesh(*b, process=False))
 
-    def _collide(self, **wanted):
+    def any(self, **wanted):
         answers = []
         for matrix in self.matrices:
             self.b.set_transform("b", matrix)
             answers.append(self.a.in_collision_other(self.b, **wanted))
         return answers
 
-    def any(self):
-        return self._collide()
-
     def faces(self):
-        return self._collide(return_data=True)
+        return self.any(return_data=True)
 
     @staticmethod
     def face_pairs(answer):

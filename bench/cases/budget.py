@@ -12,7 +12,6 @@ all of its cost and none of its gain.
 import gc
 import importlib.util
 import time
-from pathlib import Path
 
 import numpy as np
 
@@ -24,7 +23,6 @@ from warp_abtree.simulate.budget_report import budget_report
 from .. import tables
 from ..timing import medians, one_core, summarise
 
-SCENES = Path(__file__).resolve().parents[2] / "scenes"
 NAMES = ("rain", "focus")
 OBJECTS = {"cpu": {"rain": 300, "focus": 300}, "cuda": {"rain": 4000, "focus": 1500}}
 # What is asked where bodies do not ask: a GPU counts so fast that LODs save little of a frame.
@@ -55,7 +53,7 @@ def run(device, quick=False, plots=None):
     with one_core(device):
         for name in NAMES:
             collect()
-            loaded = read_scene(name, device, QUICK_OBJECTS if quick else OBJECTS[kind][name])
+            loaded = load_scene(name, device, objects=QUICK_OBJECTS if quick else OBJECTS[kind][name])
             runs, budget = {}, None
             for controller in CONTROLLERS:
                 asked = options if budget is None else options | {"budget_ms": budget}
@@ -67,18 +65,14 @@ def run(device, quick=False, plots=None):
             if plots is not None:
                 draw_runs(name, runs, budget, plots)
         for name in STAGED:
-            loaded = read_scene(name, device, QUICK_OBJECTS if quick else None)
+            loaded = load_scene(name, device, objects=QUICK_OBJECTS if quick else None)
             yield from find_stages(loaded, name, QUICK_FRAMES // 10 if quick else STAGED_FRAMES, options)
     frames = QUICK_FRAMES // 10 if quick else FRAMES
     for name in CONTROLLED:
         if name == "herd" and importlib.util.find_spec("pxr") is None:
             continue  # its meshes need usd-core
         objects = QUICK_OBJECTS if quick else CONTROLLED_OBJECTS[kind]
-        yield from compare(read_scene(name, device, objects), name, frames)
-
-
-def read_scene(name, device, objects):
-    return load_scene(SCENES / f"{name}.toml", device, objects=objects)
+        yield from compare(load_scene(name, device, objects=objects), name, frames)
 
 
 def collect():
@@ -120,10 +114,9 @@ def draw_runs(name, runs, budget, folder):
     """Draw frame times over T, faces and certified errors of a scene under each controller."""
     rows = []
     for controller, history in runs.items():
-        about = {"controller": controller}
         for i, row in enumerate(history):
             cost = {"cost": row.total_ms / budget, "faces": row.faces, "error": row.error_mean}
-            rows.append(about | {"frame": i} | cost)
+            rows.append({"controller": controller, "frame": i} | cost)
     (figure,) = tables.pick(tables.read_layout("cases/figures.toml")["figure"], case="budget")
     print(tables.draw([figure | {"file": f"budget-{name}.svg"}], rows, folder), flush=True)
 
