@@ -15,7 +15,6 @@ import time
 
 import numpy as np
 
-import warp_abtree as ab
 from warp_abtree.app import load_scene
 from warp_abtree.lod.timing import STAGES
 from warp_abtree.simulate.budget_report import budget_report
@@ -124,7 +123,7 @@ def draw_runs(name, runs, budget, folder):
 def find_stages(loaded, name, frames, options):
     """Yield a row at the finest LODs of a scene, and one at the coarsest."""
     for lods in ("finest", "coarsest"):
-        rows = run_frames(loaded, frames, None, lods == "coarsest", options)
+        rows = run_settled(loaded, frames, options, coarsest=lods == "coarsest")
         row = {"scene": name, "objects": loaded.scene.object_count, "lods": lods}
         stages = {stage: [getattr(row, stage) for row in rows] for stage in (*STAGES, "total_ms")}
         yield row | {"hits": float(np.median([row.hits for row in rows]))} | medians(stages)
@@ -132,11 +131,11 @@ def find_stages(loaded, name, frames, options):
 
 def compare(loaded, name, frames):
     """Yield a row a budget of one scene."""
-    finest = run_frames(loaded, frames, None)
+    finest = run_settled(loaded, frames, {})
     for part in BUDGETS:
         budget = part * float(np.median([row.total_ms for row in finest]))
-        controlled = run_frames(loaded, frames, budget)
-        finest += run_frames(loaded, frames, None)
+        controlled = run_settled(loaded, frames, {"budget_ms": budget}, "predictive")
+        finest += run_settled(loaded, frames, {})
         stand, total = (float(np.median([row.total_ms for row in rows])) for rows in (finest, controlled))
         stages = medians({stage: [getattr(row, stage) for row in controlled] for stage in STAGES})
         row = {"scene": name, "objects": loaded.scene.object_count}
@@ -144,14 +143,8 @@ def compare(loaded, name, frames):
         yield row | {"error_mean": controlled[-1].error_mean, "ratio": total / stand}
 
 
-def run_frames(loaded, frames, budget, coarsest=False, options=None):
-    """Run a scene from its start, at fixed LODs or under a budget [ms]; return the second half of its rows."""
-    scene = loaded.scene
-    scene.set_lods([0 if coarsest else scene.models[model].lod_max for model in scene.object_model])
-    bodies = loaded.make_bodies()
-    motion = loaded.motion if bodies is None else bodies.motion(loaded.motion)
-    lods = None if budget is None else ab.PredictiveController(scene, budget, loaded.camera)
-    frame = ab.Frame(scene, motion, lods, "count", loaded.time_step, **(options or {}))
-    frame.warm_up()
-    collect()
-    return frame.run(frames)[frames // 2 :]
+def run_settled(loaded, frames, options, controller="none", coarsest=False):
+    """Run a scene from its start, all objects at one end of their LODs first; return the second half of its rows."""
+    models = [loaded.scene.models[model] for model in loaded.scene.object_model]
+    loaded.base_lods, loaded.sweeps = np.array([0 if coarsest else model.lod_max for model in models]), ()
+    return run_controller(loaded, controller, "count", frames, options).history[frames // 2 :]
