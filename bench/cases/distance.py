@@ -7,9 +7,7 @@ python-fcl, whose answers must be ours but for rounding.
 
 The part `points` is signed distances of random points, a tenth of them within a hundredth of the size of the surface,
 beside Warp's query of a mesh with signs by winding numbers, both a whole call. Meshes that are not closed are asked
-without signs, Warp's query with its own and without.
-
-The part `gap` is contacts with a gap beside contacts without, of knots: times by gap, and how many more.
+without signs, Warp's query with its own and without. The part `gap` is contacts of knots with a gap and without.
 """
 
 import time
