@@ -85,22 +85,20 @@ def shown(value, form=",") -> str:
 def select_rows(layout, study):
     """Return the rows of a table or figure: of its part, chosen by `where`, and summarised where it says so.
 
-    A layout's `rows` are texts, each with the values of one row of the study in it.
+    A layout's `rows` are [part, where, *texts], each with the values of one row of the study in its texts.
     """
     if "rows" in layout:
-        return [row for part in layout["rows"] for row in show_rows(part, layout["columns"], study)]
+        return [show_row(study, layout["columns"], *row) for row in layout["rows"]]
     rows = pick(study["parts"].get(layout["part"], {"rows": []})["rows"], **layout.get("where", {}))
     if rows and "select" in layout:
         rows = importlib.import_module(f"bench.studies.{study['study']}").SUMMARIES[layout["select"]](rows)
     return rows
 
 
-def show_rows(layout, columns, study) -> list:
-    """Return rows of texts, the values of one row of the study filled in."""
-    (row,) = pick(study["parts"][layout["part"]]["rows"], **layout["where"])
-    return [
-        {name: text.format(**row) for (name, _), text in zip(columns, texts, strict=True)} for texts in layout["show"]
-    ]
+def show_row(study, columns, part, where, *texts) -> dict:
+    """Return a row of texts, the values of one row of the study filled in."""
+    (row,) = pick(study["parts"][part]["rows"], **where)
+    return {name: text.format(**row) for (name, _), text in zip(columns, texts, strict=True)}
 
 
 def markdown_table(layout, study, short=None) -> str:

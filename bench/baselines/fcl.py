@@ -55,19 +55,16 @@ class Fcl:
         transforms = [self.fcl.Transform(matrix[:3, :3], matrix[:3, 3]) for matrix in matrices]
         self.b = [self.fcl.CollisionObject(self.shape_b, transform) for transform in transforms]
 
-    def _collide(self, request, poses):
-        answers = []
-        for b in self.b[poses]:
-            result = self.fcl.CollisionResult()
-            self.fcl.collide(self.a, b, request, result)
-            answers.append(result)
-        return answers
+    def _collide(self, request, b):
+        result = self.fcl.CollisionResult()
+        self.fcl.collide(self.a, b, request, result)
+        return result
 
     def any(self, poses=slice(None)):
-        return [result.is_collision for result in self._collide(self.yes_no, poses)]
+        return [self._collide(self.yes_no, b).is_collision for b in self.b[poses]]
 
     def faces(self, poses=slice(None)):
-        return self._collide(self.all, poses)
+        return [self._collide(self.all, b) for b in self.b[poses]]
 
     def distances(self, poses=slice(None)):
         """Return the distance at each of some poses, negative or 0 where A and B intersect."""
@@ -182,18 +179,15 @@ class Trimesh:
         self.a.add_object("a", trimesh.Trimesh(*a, process=False))
         self.b.add_object("b", trimesh.Trimesh(*b, process=False))
 
-    def _collide(self, **wanted):
+    def any(self, **wanted):
         answers = []
         for matrix in self.matrices:
             self.b.set_transform("b", matrix)
             answers.append(self.a.in_collision_other(self.b, **wanted))
         return answers
 
-    def any(self):
-        return self._collide()
-
     def faces(self):
-        return self._collide(return_data=True)
+        return self.any(return_data=True)
 
     @staticmethod
     def face_pairs(answer):

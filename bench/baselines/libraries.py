@@ -47,19 +47,16 @@ class Coal:
         tree.endModel()
         return tree
 
-    def _collide(self, request):
-        answers = []
-        for pose in self.poses:
-            result = self.coal.CollisionResult()
-            self.coal.collide(self.a, self.origin, self.b, pose, request, result)
-            answers.append(result)
-        return answers
+    def _collide(self, request, pose):
+        result = self.coal.CollisionResult()
+        self.coal.collide(self.a, self.origin, self.b, pose, request, result)
+        return result
 
     def any(self):
-        return [result.isCollision() for result in self._collide(self.yes_no)]
+        return [self._collide(self.yes_no, pose).isCollision() for pose in self.poses]
 
     def faces(self):
-        return self._collide(self.all)
+        return [self._collide(self.all, pose) for pose in self.poses]
 
     @staticmethod
     def face_pairs(answer):

@@ -42,7 +42,11 @@ def run(device, quick=False, only=None, count=None, models=None):
             continue
         loaded = [folder.load([file]) for file in files]
         if place is None:
-            yield {"case": name} | measure_newton(loaded, count or sizes["worlds"], device, sizes["repeats"])
+            row = {"skipped": "no package newton"}
+            if importlib.util.find_spec("newton"):
+                poses = (rest_nuts(loaded, count or sizes["worlds"], seed) for seed in (0, 1))
+                row = newton_nuts.measure(loaded, *poses, device, 3 * sizes["repeats"])
+            yield {"case": name} | row
             continue
         for kind, matrices in place(loaded, sizes["poses"]).items():
             with one_core():
@@ -50,14 +54,6 @@ def run(device, quick=False, only=None, count=None, models=None):
     if not only or "hammered" in only:
         steps = 4 if quick else hammered.STEPS
         yield {"case": "hammered"} | hammered.measure(count or sizes["nuts"], device, steps)
-
-
-def measure_newton(models, worlds, device, repeats):
-    """Return the row of nuts in worlds of Newton's, or why there is none."""
-    if importlib.util.find_spec("newton") is None:
-        return {"skipped": "no package newton"}
-    poses = (rest_nuts(models, worlds, seed) for seed in (0, 1))
-    return newton_nuts.measure(models, *poses, device, 3 * repeats)
 
 
 def rest_nuts(models, count, seed):

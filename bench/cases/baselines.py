@@ -45,20 +45,15 @@ def run(device, quick=False):
             yield about | {"peer": library} | row
 
 
-def random_matrices(rng, model_a, model_b, count):
-    """Return float64 (count, 4, 4): any rotation, B's centre in A's box grown by B's radius."""
-    (centre_a, _), (centre_b, radius_b) = map(centre_and_radius, (model_a, model_b))
-    reach = np.ptp(model_a.mesh_at(model_a.lod_max)[0], axis=0) / 2 + radius_b
-    matrices = pose_matrices(np.concatenate([np.zeros((count, 3)), random_directions(rng, count, 4)], 1))
-    matrices[:, :3, 3] = centre_a + reach * rng.uniform(-1, 1, (count, 3)) - matrices[:, :3, :3] @ centre_b
-    return matrices
-
-
 def half_in_contact(models, count):
-    """Return matrices of B, half of which make it intersect A."""
+    """Return matrices of B, half of which make it intersect A: any rotation, its centre in A's box grown by its
+    radius."""
+    (centre_a, _), (centre_b, radius_b) = map(centre_and_radius, models)
+    reach = np.ptp(models[0].mesh_at(models[0].lod_max)[0], axis=0) / 2 + radius_b
     rng, kept = np.random.default_rng(0), {True: [], False: []}
     while min(map(len, kept.values())) < (count + 1) // 2:
-        matrices = random_matrices(rng, *models, count)
+        matrices = pose_matrices(np.concatenate([np.zeros((count, 3)), random_directions(rng, count, 4)], 1))
+        matrices[:, :3, 3] = centre_a + reach * rng.uniform(-1, 1, (count, 3)) - matrices[:, :3, :3] @ centre_b
         for matrix, intersects in zip(matrices, ab.sweep(*models, matrices, device="cpu"), strict=True):
             kept[bool(intersects)].append(matrix)
     return rng.permutation([*kept[True][: (count + 1) // 2], *kept[False][: count // 2]])

@@ -12,11 +12,9 @@ all of its cost and none of its gain.
 import gc
 import importlib.util
 import time
-from pathlib import Path
 
 import numpy as np
 
-import warp_abtree as ab
 from warp_abtree.app import load_scene
 from warp_abtree.lod.timing import STAGES
 from warp_abtree.simulate.budget_report import budget_report
@@ -24,7 +22,6 @@ from warp_abtree.simulate.budget_report import budget_report
 from .. import tables
 from ..timing import medians, one_core, summarise
 
-SCENES = Path(__file__).resolve().parents[2] / "scenes"
 NAMES = ("rain", "focus")
 OBJECTS = {"cpu": {"rain": 300, "focus": 300}, "cuda": {"rain": 4000, "focus": 1500}}
 # What is asked where bodies do not ask: a GPU counts so fast that LODs save little of a frame.
@@ -55,7 +52,7 @@ def run(device, quick=False, plots=None):
     with one_core(device):
         for name in NAMES:
             collect()
-            loaded = read_scene(name, device, QUICK_OBJECTS if quick else OBJECTS[kind][name])
+            loaded = load_scene(name, device, objects=QUICK_OBJECTS if quick else OBJECTS[kind][name])
             runs, budget = {}, None
             for controller in CONTROLLERS:
                 asked = options if budget is None else options | {"budget_ms": budget}
@@ -67,18 +64,14 @@ def run(device, quick=False, plots=None):
             if plots is not None:
                 draw_runs(name, runs, budget, plots)
         for name in STAGED:
-            loaded = read_scene(name, device, QUICK_OBJECTS if quick else None)
+            loaded = load_scene(name, device, objects=QUICK_OBJECTS if quick else None)
             yield from find_stages(loaded, name, QUICK_FRAMES // 10 if quick else STAGED_FRAMES, options)
     frames = QUICK_FRAMES // 10 if quick else FRAMES
     for name in CONTROLLED:
         if name == "herd" and importlib.util.find_spec("pxr") is None:
             continue  # its meshes need usd-core
         objects = QUICK_OBJECTS if quick else CONTROLLED_OBJECTS[kind]
-        yield from compare(read_scene(name, device, objects), name, frames)
-
-
-def read_scene(name, device, objects):
-    return load_scene(SCENES / f"{name}.toml", device, objects=objects)
+        yield from compare(load_scene(name, device, objects=objects), name, frames)
 
 
 def collect():
@@ -120,10 +113,9 @@ def draw_runs(name, runs, budget, folder):
     """Draw frame times over T, faces and certified errors of a scene under each controller."""
     rows = []
     for controller, history in runs.items():
-        about = {"controller": controller}
         for i, row in enumerate(history):
             cost = {"cost": row.total_ms / budget, "faces": row.faces, "error": row.error_mean}
-            rows.append(about | {"frame": i} | cost)
+            rows.append({"controller": controller, "frame": i} | cost)
     (figure,) = tables.pick(tables.read_layout("cases/figures.toml")["figure"], case="budget")
     print(tables.draw([figure | {"file": f"budget-{name}.svg"}], rows, folder), flush=True)
 
@@ -131,7 +123,7 @@ def draw_runs(name, runs, budget, folder):
 def find_stages(loaded, name, frames, options):
     """Yield a row at the finest LODs of a scene, and one at the coarsest."""
     for lods in ("finest", "coarsest"):
-        rows = run_frames(loaded, frames, None, lods == "coarsest", options)
+        rows = run_settled(loaded, frames, options, coarsest=lods == "coarsest")
         row = {"scene": name, "objects": loaded.scene.object_count, "lods": lods}
         stages = {stage: [getattr(row, stage) for row in rows] for stage in (*STAGES, "total_ms")}
         yield row | {"hits": float(np.median([row.hits for row in rows]))} | medians(stages)
@@ -139,11 +131,11 @@ def find_stages(loaded, name, frames, options):
 
 def compare(loaded, name, frames):
     """Yield a row a budget of one scene."""
-    finest = run_frames(loaded, frames, None)
+    finest = run_settled(loaded, frames, {})
     for part in BUDGETS:
         budget = part * float(np.median([row.total_ms for row in finest]))
-        controlled = run_frames(loaded, frames, budget)
-        finest += run_frames(loaded, frames, None)
+        controlled = run_settled(loaded, frames, {"budget_ms": budget}, "predictive")
+        finest += run_settled(loaded, frames, {})
         stand, total = (float(np.median([row.total_ms for row in rows])) for rows in (finest, controlled))
         stages = medians({stage: [getattr(row, stage) for row in controlled] for stage in STAGES})
         row = {"scene": name, "objects": loaded.scene.object_count}
@@ -151,14 +143,8 @@ def compare(loaded, name, frames):
         yield row | {"error_mean": controlled[-1].error_mean, "ratio": total / stand}
 
 
-def run_frames(loaded, frames, budget, coarsest=False, options=None):
-    """Run a scene from its start, at fixed LODs or under a budget [ms]; return the second half of its rows."""
-    scene = loaded.scene
-    scene.set_lods([0 if coarsest else scene.models[model].lod_max for model in scene.object_model])
-    bodies = loaded.make_bodies()
-    motion = loaded.motion if bodies is None else bodies.motion(loaded.motion)
-    lods = None if budget is None else ab.PredictiveController(scene, budget, loaded.camera)
-    frame = ab.Frame(scene, motion, lods, "count", loaded.time_step, **(options or {}))
-    frame.warm_up()
-    collect()
-    return frame.run(frames)[frames // 2 :]
+def run_settled(loaded, frames, options, controller="none", coarsest=False):
+    """Run a scene from its start, all objects at one end of their LODs first; return the second half of its rows."""
+    models = [loaded.scene.models[model] for model in loaded.scene.object_model]
+    loaded.base_lods, loaded.sweeps = np.array([0 if coarsest else model.lod_max for model in models]), ()
+    return run_controller(loaded, controller, "count", frames, options).history[frames // 2 :]

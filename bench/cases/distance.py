@@ -7,9 +7,7 @@ python-fcl, whose answers must be ours but for rounding.
 
 The part `points` is signed distances of random points, a tenth of them within a hundredth of the size of the surface,
 beside Warp's query of a mesh with signs by winding numbers, both a whole call. Meshes that are not closed are asked
-without signs, Warp's query with its own and without.
-
-The part `gap` is contacts with a gap beside contacts without, of knots: times by gap, and how many more.
+without signs, Warp's query with its own and without. The part `gap` is contacts of knots with a gap and without.
 """
 
 import time
@@ -33,6 +31,7 @@ GAP_FULL = shapes.KNOT_PAIRS | {"pairs": (64, 1024, 8192)}
 GAP_QUICK = {"faces": 300, "pairs": (4,), "distances": (0.2,), "repeats": 2}
 GAPS = 0.0, 1e-4, 3e-4, 1e-3, 3e-3  # of the mesh's size
 PARTS = ("nearest", "points", "gap")
+ROUNDED = 1e-12  # of the size: distances in float64 differ by less
 MESHES = ("cow", "rocker-arm", "stanford-bunny")
 
 
@@ -122,7 +121,7 @@ def measure_points(name, model, device, count, has_signs):
 
 
 def measure(name, models, matrices, device, repeats):
-    """Return the row of one workload."""
+    """Return the row of one workload; raise a RuntimeError where python-fcl's distances are others."""
     scene, pairs = shapes.scene_of_poses(device, *models, matrices)
     query, fresh = ab.DistanceQuery(scene, pairs), ab.DistanceQuery(scene, pairs)
     found = fresh.run()
@@ -135,7 +134,12 @@ def measure(name, models, matrices, device, repeats):
         if device.is_cpu:
             launches["calls"] = make_calls(models, matrices, device)
             try:
-                launches["fcl"] = make_fcl(models, matrices, found, row).distances
+                fcl = Fcl(*(model.mesh_at(model.lod_max)[:2] for model in models), matrices)
+                error = np.abs(fcl.distances() - found.distance)[~found.any].max(initial=0.0)
+                row["fcl_differs"] = error / max(map(shapes.longest_side, models))
+                if row["fcl_differs"] > ROUNDED:
+                    raise RuntimeError(f"python-fcl's distances differ by {row['fcl_differs']} of the size")
+                launches["fcl"] = fcl.distances
             except ImportError as error:
                 row["fcl_skipped"] = str(error)
         with timing.no_garbage_collection():
@@ -158,19 +162,6 @@ def make_calls(models, matrices, device):
 
     call_each()
     return call_each
-
-
-def make_fcl(models, matrices, found, row):
-    """Return python-fcl; raise a RuntimeError where its distances differ from ours by more than float64's rounding."""
-    meshes = [model.mesh_at(model.lod_max)[:2] for model in models]
-    fcl = Fcl(*meshes, matrices)
-    apart = ~found.any
-    error = np.abs(fcl.distances() - found.distance)[apart].max(initial=0.0)
-    size = max(shapes.longest_side(model) for model in models)
-    if error > 1e-12 * size:
-        raise RuntimeError(f"python-fcl's distances differ by {error / size} of the size")
-    row["fcl_differs"] = error / size
-    return fcl
 
 
 def time_gaps(device, model, poses, repeats):

@@ -7,6 +7,7 @@ import functools
 import itertools
 import multiprocessing
 import sys
+from collections import Counter
 
 import numpy as np
 import warp as wp
@@ -30,6 +31,7 @@ CHUNK = 20_000
 WHOLE_EVERY = 64
 ORDERS = list(itertools.product(itertools.permutations(range(3)), itertools.permutations(range(3)), (0, 1)))
 STAGES = ("float32_stage_ns", "float64_stage_ns", "exact_stage_ns", "float32_ns")
+PER_PAIR = ("meet", "to_float64", "to_exact", "float32_errors", *STAGES)
 
 
 def run(device, count=None, quick=False):
@@ -47,9 +49,12 @@ def run(device, count=None, quick=False):
     with multiprocessing.get_context("spawn").Pool(1 if quick else None) as pool:
         chunks = zip(jobs, pool.imap(find_truth, jobs), strict=True)
         for kind, group in itertools.groupby(chunks, key=lambda chunk: chunk[0][0]):
-            tally = sum(check_chunk(job, truth, device) for job, truth in group)
-            wrong += tally[2]
-            yield describe_tally(kind, tally)
+            tally = Counter()
+            for job, truth in group:
+                tally.update(check_chunk(job, truth, device))
+            wrong += tally["disagreements"]
+            row = {"kind": kind, "pairs": tally["pairs"], "disagreements": tally["disagreements"]}
+            yield row | {name: (1e6 if name in STAGES else 1) * tally[name] / tally["pairs"] for name in PER_PAIR}
     if wrong:
         raise RuntimeError("exact signs gave a wrong answer")
     yield from measure_meshes(device, QUICK if quick else FULL)
@@ -164,7 +169,7 @@ def unit_size(pairs):
 
 
 def check_chunk(job, truth, device):
-    """Compare one chunk on a device with the truth; return its tally."""
+    """Compare one chunk on a device with the truth; return its tally, times in [ms]."""
     pairs, rows = make_chunk(job), np.arange(len(truth))
     if job[0] != "random":
         pairs, rows = reorder_pairs(pairs)
@@ -187,14 +192,6 @@ def check_chunk(job, truth, device):
     unproven, unproven_time = ask_float32(pairs, device, proven=False)
     rest = np.flatnonzero(unproven == UNCERTAIN)
     unproven[rest], rest_time = ask(FLOAT32, unit_size(pairs[rest]), device)
-    counts = [len(truth), truth.sum(), len(wrong), len(to_float64), len(to_exact), (unproven != truth).sum()]
-    return np.array([*counts, single_time, double_time, exact_time, unproven_time + rest_time], float)
-
-
-def describe_tally(kind, tally):
-    """Turn a tally into a row."""
-    pairs, hits, wrong, to_float64, to_exact, unproven, *times = tally.tolist()
-    shares = {"meet": hits, "to_float64": to_float64, "to_exact": to_exact, "float32_errors": unproven}
-    row = {"kind": kind, "pairs": int(pairs), "disagreements": int(wrong)}
-    row |= {name: count / pairs for name, count in shares.items()}
-    return row | {name: 1e6 * t / pairs for name, t in zip(STAGES, times, strict=True)}
+    counts = len(truth), len(wrong), truth.sum(), len(to_float64), len(to_exact), (unproven != truth).sum()
+    times = single_time, double_time, exact_time, unproven_time + rest_time
+    return dict(zip(("pairs", "disagreements", *PER_PAIR), (*counts, *times), strict=True))

@@ -96,10 +96,8 @@ def time_query(query, others, result, repeats):
     """Return the times of a query and others, in turn; the timed answer must be the checked one."""
     times = time_in_turn({"ours": query.launch} | others, query.device, repeats)
     query.launch()
-    known = [tuple(row) for row in np.column_stack([result.pairs, result.count]).tolist()]
-    count = int(query.pair_count.numpy()[0])
-    again = np.column_stack([query.pairs.numpy()[:count].reshape(-1, 2), query.hits.count.numpy()[:count]]).tolist()
-    if sorted(known) != sorted(map(tuple, again)):
+    known, again = (np.column_stack([found.pairs, found.count]).tolist() for found in (result, query.result()))
+    if sorted(known) != sorted(again):
         raise RuntimeError("the timed query's answer differs from the checked one")
     return times
 

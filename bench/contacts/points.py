@@ -1,12 +1,15 @@
 """Contact points of nuts at rest on bolts: penetration that they allow, and times of a launch.
 
-A row for all faces and for each tolerance of the LODs. Penetration [um] is that of `bench.contacts.penetration`, over
-twists of all poses: mean, 95th percentile and largest, and mean and 95th percentile of the worst pose. Times are of a
-launch over `--count` worlds at once, a nut and a bolt each; and of one world alone, on the CPU the time of the thread
-on one core, in turn with the face pairs of that world.
+A row for all faces and for each tolerance of the LODs. Penetration [um] is how deep the near faces of a pair get before
+one of its points stops a motion, over twists of all poses: mean, 95th percentile and largest, and mean and 95th
+percentile of the worst pose. The second object moves along a twist until a point blocks, at most twice the gap. To
+first order, and without friction: a contact at p with normal n comes apart at the rate n . (v + w x (p - c)). All near
+faces, as points, allow none. Times are of a launch over `--count` worlds at once, a nut and a bolt each; and of one
+world alone, on the CPU the time of the thread on one core, in turn with the face pairs of that world.
 """
 
 import time
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,15 +17,17 @@ import warp_abtree as ab
 
 from ..cases.assembly import rest_nuts
 from ..meshes import NUT, ModelFolder
-from ..shapes import scene_of_poses
+from ..shapes import random_directions, scene_of_poses
 from ..timing import medians, one_core, ratio_of, time_in_turn
-from .penetration import Contacts, near_contacts, penetration_allowed
 
 FULL = {"poses": 8, "worlds": {"cuda": 1024, "cpu": 8}, "repeats": 5}
 QUICK = {"poses": 2, "worlds": {"cuda": 2, "cpu": 2}, "repeats": 1}
 LODS = {"all faces": None, "10 um": 1e-5, "30 um": 3e-5}  # tolerance [m]
 GAP = 1e-4  # of the pair [m]
 ASKED = (16, 32)
+TWISTS, SEED = 2000, 20_260
+CHUNK = 100  # twists at once
+SLOWEST = 1e-9  # rate of approach under which a point does not block
 SPARE = 1.1  # room for crossing faces over those of as many worlds like the judged ones
 
 
@@ -55,6 +60,43 @@ def run(device, quick=False, count=None, models=None):
             yield row | time_worlds(device, parts, lods, placed, asked, found, sizes["repeats"])
 
 
+class Contacts(NamedTuple):
+    """Contacts of one pair, world frame; normals from the first object to the second."""
+
+    point: np.ndarray  # (k, 3) [m]
+    normal: np.ndarray  # (k, 3)
+    separation: np.ndarray  # (k,) [m], negative inside
+
+
+def random_twists(contacts: Contacts, count=TWISTS):
+    """Return twists (count, 6), velocities and angular velocities about the mean of the contacts, and that mean.
+
+    Their length is 1, a rotation counted by the speed of the contact that is farthest from the mean.
+    """
+    centre = contacts.point.mean(0)
+    size = np.linalg.norm(contacts.point - centre, axis=1).max()
+    twists = random_directions(np.random.default_rng(SEED), count, 6)
+    twists[:, 3:] /= size
+    return twists, centre
+
+
+def wrenches(contacts: Contacts, centre):
+    """Return what a twist is multiplied by for the rate at which each contact comes apart, (k, 6)."""
+    return np.concatenate([contacts.normal, np.cross(contacts.point - centre, contacts.normal)], 1)
+
+
+def penetration_allowed(contacts: Contacts, points: Contacts, gap, count=TWISTS):
+    """Return how much deeper than at the start the near faces get along each twist [m], (count,)."""
+    twists, centre = random_twists(contacts, count)
+    approach = -(twists @ wrenches(points, centre).T)
+    room = np.where(approach > SLOWEST, np.maximum(points.separation, 0), np.inf)
+    moved = twists * (room / np.maximum(approach, SLOWEST)).min(1, initial=2 * gap)[:, None]  # until a point blocks
+    across, at_start = wrenches(contacts, centre).T, max(0.0, -contacts.separation.min())
+    parts = np.split(moved, range(CHUNK, count, CHUNK))
+    least = np.concatenate([(part @ across + contacts.separation).min(1) for part in parts])
+    return np.maximum(0.0, -least) - at_start
+
+
 def points_of(found, p) -> Contacts:
     """Return the contact points of a pair."""
     own = found.points["pair"] == p
@@ -67,7 +109,8 @@ def judge(near, found) -> dict:
         raise RuntimeError("contacts and contact points differ about what intersects")
     allowed = []
     for p in range(len(near.pairs)):
-        contacts = near_contacts(near.contacts[near.contacts["pair"] == p])
+        rows = near.contacts[near.contacts["pair"] == p]
+        contacts = Contacts((rows["p0"] + rows["p1"]) / 2, rows["normal"], rows["separation"])
         allowed.append(1e6 * penetration_allowed(contacts, points_of(found, p), GAP))
     allowed = np.array(allowed)
     means, tails = allowed.mean(1), np.percentile(allowed, 95, axis=1)
@@ -76,19 +119,14 @@ def judge(near, found) -> dict:
     return row | {"worst_pose_um": means.max(), "worst_pose_p95_um": tails.max()}
 
 
-def scene_of_worlds(device, models, lods, matrices):
-    """Return a scene that has a bolt and a nut in each world, and its pairs (2 w, 2 w + 1)."""
+def time_worlds(device, models, lods, matrices, asked, found, repeats) -> dict:
+    """Return the columns of times of a bolt and a nut in each world; raise a RuntimeError where worlds have other
+    points than the poses judged."""
     scene, worlds = ab.Scene(device=device), len(matrices)
-    poses = np.tile(np.eye(4), (2 * worlds, 1, 1))
+    pairs, poses = np.arange(2 * worlds).reshape(-1, 2), np.tile(np.eye(4), (2 * worlds, 1, 1))
     poses[1::2] = matrices
     scene.add_many(models * worlds, poses, worlds=np.arange(2 * worlds) // 2)
     scene.set_lods(lods * worlds)
-    return scene, np.arange(2 * worlds).reshape(-1, 2)
-
-
-def time_worlds(device, models, lods, matrices, asked, found, repeats) -> dict:
-    """Return the columns of times; raise a RuntimeError where worlds have other points than the poses judged."""
-    scene, pairs = scene_of_worlds(device, models, lods, matrices)
     capacity = ab.Buffers(hits=1024 + int(SPARE * found.count.mean() * len(pairs)))
     query = ab.ManifoldQuery(scene, pairs, capacity, gap=GAP, points=asked)
     result = query.run()

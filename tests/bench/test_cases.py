@@ -14,7 +14,7 @@ from bench import timing
 from bench.baselines import newton_nuts
 from bench.baselines.newton import SDF_RESOLUTION
 from bench.cases import budget, build, distance, host
-from bench.contacts import penetration, points
+from bench.contacts import points
 from bench.gate import compare
 from bench.tables import pick
 from warp_abtree import testing
@@ -235,7 +235,7 @@ SMALLER = {
     "gate": {(compare, "Tree"): FewLaunches, (compare.tempfile, "TemporaryDirectory"): kept_kernels},
     "points": {
         (points, "LODS"): {name: points.LODS[name] for name in ("all faces", "30 um")},
-        (points, "penetration_allowed"): partial(penetration.penetration_allowed, count=200),
+        (points, "penetration_allowed"): partial(points.penetration_allowed, count=200),
     },
 }
 

@@ -9,7 +9,7 @@ import trimesh
 import warp_abtree as ab
 from bench import timing
 from bench.cases.update import bound_nodes
-from bench.contacts import penetration
+from bench.contacts import points
 from bench.studies.motions import Motions, find_first_contact
 from bench.studies.paper import update
 from bench.studies.tradeoff import regions, summaries, workload
@@ -141,26 +141,26 @@ def test_means_over_workloads():
 
 def corners_at(separations):
     """Return contacts at the corners of a square of side 2 over a floor."""
-    points = np.array([(-1.0, -1, 0), (1, -1, 0), (-1, 1, 0), (1, 1, 0)])
-    return penetration.Contacts(points, np.tile([0, 0, 1.0], (4, 1)), np.array(separations))
+    corners = np.array([(-1.0, -1, 0), (1, -1, 0), (-1, 1, 0), (1, 1, 0)])
+    return points.Contacts(corners, np.tile([0, 0, 1.0], (4, 1)), np.array(separations))
 
 
 def test_penetration_that_points_allow():
     """Four corners allow none; their middle alone lets a square tilt about it, none at all lets it through."""
     gap, square = 0.1, corners_at([0.02, 0.0, 0.05, 0.03])
-    assert np.abs(penetration.penetration_allowed(square, square, gap)).max() < 1e-15
-    twists, centre = penetration.random_twists(square)
+    assert np.abs(points.penetration_allowed(square, square, gap)).max() < 1e-15
+    twists, centre = points.random_twists(square)
     assert np.allclose(np.linalg.norm(twists * [1, 1, 1, 2**0.5, 2**0.5, 2**0.5], axis=1), 1) and not centre.any()
     rates = twists[:, 2:3] + twists[:, 3:4] * square.point[:, 1] - twists[:, 4:5] * square.point[:, 0]
-    middle = penetration.Contacts(np.zeros((1, 3)), np.array([[0, 0, 1.0]]), np.array([0.02]))
+    middle = points.Contacts(np.zeros((1, 3)), np.array([[0, 0, 1.0]]), np.array([0.02]))
     goes = np.where(twists[:, 2] < 0, np.minimum(2 * gap, 0.02 / np.abs(twists[:, 2])), 2 * gap)
-    for points, way in ((middle, goes), (penetration.Contacts(*(part[:0] for part in square)), 2 * gap + 0 * goes)):
+    for kept, way in ((middle, goes), (points.Contacts(*(part[:0] for part in square)), 2 * gap + 0 * goes)):
         expected = np.maximum(0, -(square.separation + rates * way[:, None]).min(1))
-        np.testing.assert_allclose(penetration.penetration_allowed(square, points, gap), expected, atol=1e-15)
+        np.testing.assert_allclose(points.penetration_allowed(square, kept, gap), expected, atol=1e-15)
     # What is inside when a motion begins is not counted, and a point that is inside blocks at once.
     sunk = corners_at([-0.01, 0.02, 0.02, 0.02])
-    deepest = penetration.Contacts(*(part[:1] for part in sunk))
-    allowed = penetration.penetration_allowed(sunk, deepest, 0.1)
-    twists, centre = penetration.random_twists(sunk)
-    blocked = penetration.wrenches(deepest, centre) @ twists.T < 0
+    deepest = points.Contacts(*(part[:1] for part in sunk))
+    allowed = points.penetration_allowed(sunk, deepest, 0.1)
+    twists, centre = points.random_twists(sunk)
+    blocked = points.wrenches(deepest, centre) @ twists.T < 0
     assert np.abs(allowed[blocked[0]]).max() == 0 and allowed.max() > 0.01

@@ -16,7 +16,7 @@ import warp as wp
 from ...baselines.fcl import Fcl
 from ...baselines.newton import Newton
 from ...shapes import pose_matrices
-from .workload import find_front, judge_answers, judge_contact, time_rows, workloads
+from .workload import find_front, judge_answers, judge_contact, time_rows
 
 FRACTIONS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
 QUICK_FRACTIONS = (0.02, 0.1, 0.5, 1)
@@ -132,25 +132,20 @@ def newton_points(context, workload):
             context.note(f"{NEWTON_SDF} {setting} is skipped for {workload.name}: {type(error).__name__}: {error}")
 
 
-def run(context):
-    """Yield one row a workload, method and setting."""
+def run(context, workload):
+    """Return one row a method and setting, with its time and whether no other one beats it in time and error.
+
+    Times are taken in turn. Launches are of all poses; on a GPU ours are of the tiled ones. Rows without a launch are
+    timed already.
+    """
     versions = {package.name: package.version for package in metadata.distributions()}
     names = "python-fcl", "trimesh", "newton"
     context.note(f"Versions: {', '.join(f'{name} {versions.get(name)}' for name in names)}.")
-    for workload in workloads(context):
-        found = []
-        for points in (our_points, newton_points, fcl_points):
-            for row, launch in points(context, workload):
-                context.progress(f"{workload.name}: {row['method']}, {row['setting']}")
-                found.append((row, launch))
-        yield from time_points(context, workload, found)
-
-
-def time_points(context, workload, found):
-    """Return the rows of (row, launch) with their times, taken in turn, and which no other one beats in time and error.
-
-    Launches are of all poses; on a GPU ours are of the tiled ones. Rows without a launch are timed already.
-    """
+    found = []
+    for points in (our_points, newton_points, fcl_points):
+        for row, launch in points(context, workload):
+            context.progress(f"{workload.name}: {row['method']}, {row['setting']}")
+            found.append((row, launch))
     rows = [row for row, _ in found]
     for on_gpu in (False, True):
         mine = {k: launch for k, (row, launch) in enumerate(found) if launch and (row["where"] == "GPU") == on_gpu}

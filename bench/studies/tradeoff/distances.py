@@ -9,21 +9,13 @@ import numpy as np
 
 from ...baselines.fcl import Fcl
 from ...shapes import pose_matrices
-from .workload import relate, time_rows, workloads
+from .workload import relate, time_rows
 
 GAPS = (0.3, 0.1, 0.03, 0.01)  # of the size, from the first contact
 FRACTIONS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
 QUICK_FRACTIONS = (0.02, 0.1, 1)
 RELATIVE = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
 OURS, OURS_FCL, TOLERANCE = "our LODs", "our LODs, python-fcl", "tolerance at the finest LODs"
-
-
-def find_poses(context, workload):
-    """Return poses apart, on CUDA several times over, and how many of the first are not repeated."""
-    posed = min(context.size(24, 6), len(workload.low))
-    which = np.tile(np.arange(posed), len(GAPS))
-    along = workload.low[which] + np.repeat(GAPS, posed) * workload.size
-    return workload.repeated(workload.motions.poses(along, which)), len(which)
 
 
 def describe(workload, method, found, truth, proved, share, where):
@@ -33,9 +25,12 @@ def describe(workload, method, found, truth, proved, share, where):
     return row | {"proved": proved / workload.size, "distance_mean": error.mean(), "distance_max": error.max()}
 
 
-def measure(context, workload):
+def run(context, workload):
     """Return rows of LODs and of tolerances at the finest, and of python-fcl on the LODs, with their times."""
-    poses, once = find_poses(context, workload)
+    posed = min(context.size(24, 6), len(workload.low))
+    which = np.tile(np.arange(posed), len(GAPS))
+    along = workload.low[which] + np.repeat(GAPS, posed) * workload.size
+    poses, once = workload.repeated(workload.motions.poses(along, which)), len(which)
     where = "CPU core" if context.device.is_cpu else "GPU"
     levels = {value: workload.lods(fraction=value) for value in context.size(FRACTIONS, QUICK_FRACTIONS)}
     truth = workload.query(levels[1], poses, "distance").run().distance
@@ -64,9 +59,3 @@ def measure(context, workload):
             theirs[key] = fcl.distances
         time_rows(context, rows, theirs, once, on_core=True)
     return relate(rows, (OURS, "1 of the faces"))
-
-
-def run(context):
-    """Yield one row a workload, method and setting."""
-    for workload in workloads(context):
-        yield from measure(context, workload)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from .regions import compare_normals, compare_regions, make_regions, resultants
-from .workload import judge_answers, judge_contact, workloads
+from .workload import judge_answers, judge_contact
 
 FRACTIONS = (0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
 # Of the longest side, both models' errors together.
@@ -64,12 +64,11 @@ class LodLevels:
         return rows
 
 
-def run(context):
-    """Yield one row a workload and level, and one a distance from the first contact."""
-    for workload in workloads(context):
-        levels = LodLevels(workload)
-        for value in context.size(FRACTIONS, QUICK_FRACTIONS):
-            yield from levels.measure("fraction", value, workload.lods(fraction=value))
-        for value in context.size(TOLERANCES, QUICK_TOLERANCES):
-            yield from levels.measure("tolerance", value, workload.lods(tolerance=value))
-        yield from levels.time(context)
+def run(context, workload):
+    """Yield one row a level, and one a distance from the first contact."""
+    levels = LodLevels(workload)
+    for value in context.size(FRACTIONS, QUICK_FRACTIONS):
+        yield from levels.measure("fraction", value, workload.lods(fraction=value))
+    for value in context.size(TOLERANCES, QUICK_TOLERANCES):
+        yield from levels.measure("tolerance", value, workload.lods(tolerance=value))
+    yield from levels.time(context)

@@ -11,7 +11,7 @@ import warp_abtree as ab
 from warp_abtree.checks.quaternions import matrices_of, multiply_quaternions, quaternions_about
 
 from ...shapes import random_directions
-from .workload import relate, time_rows, workloads
+from .workload import relate, time_rows
 
 TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 FRACTIONS = (0.01, 0.1, 0.5)
@@ -63,9 +63,9 @@ class Contacts:
         return row | {name: values[once].mean() for name, values in tests.items()}
 
 
-def measure(context, contacts):
+def run(context, workload):
     """Return rows of tolerances at the finest LODs, and of LODs with the usual one, with their times."""
-    rows, queries = {}, {}
+    contacts, rows, queries = Contacts(workload), {}, {}
     settings = [(TOLERANCE, f"{tolerance:.0e}", 1, tolerance) for tolerance in TOLERANCES]
     settings += [(OURS, f"{fraction:g} of the faces", fraction, USUAL) for fraction in (*FRACTIONS, 1)]
     for method, setting, fraction, tolerance in settings:
@@ -73,9 +73,3 @@ def measure(context, contacts):
         rows[method, setting] = contacts.row(method, setting, query.run())
     time_rows(context, rows, {key: query.launch for key, query in queries.items()}, len(query.pairs))
     return relate(rows, (OURS, "1 of the faces"))
-
-
-def run(context):
-    """Yield one row a workload, and tolerance or LOD."""
-    for workload in workloads(context):
-        yield from measure(context, Contacts(workload))

@@ -32,6 +32,11 @@ def workloads(context):
         yield Workload(context, name, model_a, model_a if a == b else context.model(b))
 
 
+def part_of(run):
+    """Return the part of the study that yields the rows which `run(context, workload)` has of each workload."""
+    return lambda context: (row for workload in workloads(context) for row in run(context, workload))
+
+
 class Workload:
     """Two models, motions with their first contact at the finest LODs, exact, and poses about it.
 
