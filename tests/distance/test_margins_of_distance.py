@@ -172,3 +172,4 @@ def test_slabs_leave_off_what_roundings_add_up_to():
     room = float(BOUND_MARGINS) / 2 * float(ROUNDING_32) / 2.0**-24
     assert room >= max(*along, *across) and int(BOUND_MARGINS) == native.constant("SLAB_MARGINS")
     assert "boxes.margin = SLAB_MARGINS * scaling.margin;" in native.read("distance/search.h")
+    assert native.read("distance/slab_bounds.h").count(" - margin)") == 3  # along n, across it, along a node's own

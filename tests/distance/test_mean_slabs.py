@@ -11,7 +11,7 @@ from warp_abtree.kernels.search.mean_slabs import USES_MIN
 
 
 def read_slabs(device, model, lod):
-    """Return a state of a model, and the records of its nodes: normal, ends, weight and radius, float64 (nodes, 7)."""
+    """Return a state of a model, and the records of its nodes: normal, ends, weight and radius, float32 (nodes, 7)."""
     scene = scene_of(device, [(model, lod, STILL, sample("box"), None, STILL)])
     query = ab.DistanceQuery(scene, [(0, 1)] * max(int(PAIRS_LEAST), int(USES_MIN)))
     for _ in range(2):
@@ -19,7 +19,7 @@ def read_slabs(device, model, lod):
     slabs = query.stages[-1].slabs
     assert slabs.made.numpy()[0, 0] == lod
     state = scene.tree_state(0)
-    records = slabs.record.numpy().reshape(-1, 8)[: len(state.status), :7].astype(float)
+    records = slabs.record.numpy().reshape(-1, 8)[: len(state.status), :7]  # of inactive nodes no numbers
     return state, records
 
 
@@ -37,7 +37,7 @@ def test_slabs_and_balls_hold_their_faces(device, regime, name, part):
     for node in np.flatnonzero(state.status):
         below = corners[leaves >> np.maximum(depth_of(leaves) - depth_of(node), 0) == node]
         assert len(below)
-        normal, (low, high, _, radius) = records[node, :3], records[node, 3:]
+        normal, (low, high, _, radius) = np.split(records[node].astype(float), [3])
         along, middle = below @ normal, (state.lower[node] + state.upper[node]) / 2 - model.centre
         reach = np.linalg.norm(below - middle, axis=2).max()
         assert abs(np.linalg.norm(normal) - 1) < 1e-6 or not normal.any()
