@@ -59,6 +59,26 @@ def test_sums_and_products_lose_nothing(device, kind):
     assert [Fraction(h) + Fraction(t) for h, t in zip(high.tolist(), low.tolist())] == exact
 
 
+@wp.kernel
+def add_words_kernel(a: wp.array[wp.vec2d], b: wp.array[wp.vec2d], sum_out: wp.array[wp.vec2d]):
+    i = wp.tid()
+    sum_out[i] = add_double(a[i], b[i])
+
+
+def test_sums_of_double_words_keep_their_bound(device):
+    """Of words of either sign whose high words cancel, whole or but for some units in the last place."""
+    rng = np.random.default_rng(2)
+    high = random_floats(rng, 800, -40, 40)
+    other = np.where(rng.random(800) < 0.7, -high, random_floats(rng, 800, -40, 40))
+    other += rng.integers(-2, 3, 800) * np.spacing(other) * (rng.random(800) < 0.5)
+    words = [np.stack([x, random_floats(rng, 800, -9, -1) * np.spacing(np.abs(x))], 1) for x in (high, other)]
+    found = launch(add_words_kernel, device, 800, *words)
+    for got, a, b in zip(found.tolist(), *(w.tolist() for w in words)):
+        exact = sum(map(Fraction, (*a, *b)))
+        assert abs(sum(map(Fraction, got)) - exact) <= abs(exact) * (3 + Fraction(13, 2**53)) / 2**106
+        assert got[0] + got[1] == got[0]
+
+
 STAGES = ("filter", "float32", "exact", "long", "integer", "double")  # the first three by their modes
 
 
@@ -239,6 +259,26 @@ def test_integers_tell_small_determinants(device, kind, form, share):
         assert sign != int(UNCERTAIN) or not small
         told += small
     assert told > 3 or kind == "random"
+
+
+@pytest.mark.parametrize("form", ["2D", "3D"])
+def test_integers_leave_what_128_bits_may_not_hold(device, form):
+    """Determinants about 2^127 units, four times their bound: a sign is right or left open, no smaller one is."""
+    dim, _ = FORMS[form]
+    rng, points = np.random.default_rng(4), np.zeros((COUNT, dim + 1, dim))
+    digits, exponents = rng.integers(1 - 2**53, 2**53, (COUNT, dim, dim)), (8, 13) if dim == 2 else (-11, -8)
+    points[:, :-1] = np.rint(digits * 2.0 ** rng.integers(*exponents, (COUNT, dim, dim)))
+    points[:, range(dim), range(dim)] = 1.0  # the unit of each row
+    values = [sum(true_terms(rows)) for rows in points.tolist()]
+    bound = [np.nextafter(float(abs(x) / 4), np.inf) for x in values]
+    found, counts = ask(device, form, points, bound)["integer"], [0, 0]
+    for rows, value, sign in zip(points.tolist(), values, found):
+        assert sign in ((value > 0) - (value < 0), int(UNCERTAIN))
+        size = abs(value) / Fraction(2) ** unit_of(rows)
+        assert sign != int(UNCERTAIN) or size > 2**124
+        counts[0] += size > 2**127
+        counts[1] += sign != int(UNCERTAIN)
+    assert min(counts) > 20, counts
 
 
 @pytest.mark.parametrize("form", ["2D", "3D"])
