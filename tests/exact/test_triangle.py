@@ -5,14 +5,13 @@ from functools import partial
 import numpy as np
 import pytest
 import warp as wp
+from conftest import slow
 from helpers.questions import launch
 from oracles import triangle as oracle
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.exact.predicates import EXACT, FILTER, UNCERTAIN
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
-
-pytestmark = pytest.mark.slow
 
 wp.set_module_options(native.options("base/lanes.cuh", "exact/determinant.cuh"))
 
@@ -90,10 +89,11 @@ KINDS = {
 }
 
 
+@pytest.mark.parametrize("share", [5, *slow(1)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_answers_are_exact(device, kind):
+def test_answers_are_exact(device, kind, share):
     make, count = KINDS[kind]
-    rng = np.random.default_rng(1)
+    rng, count = np.random.default_rng(1), count // share
     pairs = make(rng, count)
     expected = truth(pairs)
     assert 0.02 < expected.mean() < 0.99, "both answers need to occur"
