@@ -86,7 +86,7 @@ def test_segments_are_alike_whichever_corner_is_twice(device, meets):
 
 @pytest.mark.parametrize(("way", "outcome"), [(3, TOUCHES), (1.75, CLEAR)])
 def test_segments_on_one_line_meet_end_to_end(device, way, outcome):
-    """Either way round, one on the other's line; others' ends prove nothing."""
+    """Either way round, whichever corner is twice."""
     first, second = np.array([(0, 0, 0), (1, 0, 0)], float), np.array([(3, 0, 0), (4, 0, 0)], float)
     starts = np.array([[*first[list(a)], *second[list(b)]] for a in ENDS for b in ENDS])
     ends = starts + np.array([way, 0, 0]) * (np.arange(6) < 3)[:, None]

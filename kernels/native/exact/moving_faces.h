@@ -44,7 +44,7 @@ struct MovingFaces {
         if (features.edges) {
             // Of a face that is one corner, its first edge stands for it.
             const int i = (pair - 6) / 3, j = 3 + (pair - 6) % 3;
-            return !(same[i] && (i != 0 || !same[1])) && !(same[j] && (j != 3 || !same[4]));
+            return !(same[i] && i != 0) && !(same[j] && j != 3);
         }
         // What meets a face without area meets an edge of it.
         const int face = pair < 3 ? 3 : 0;
