@@ -200,6 +200,7 @@ def launches(ask):
 def kernels_of(device):
     """Return registers, local and shared memory [bytes] of every loaded CUDA kernel, by its name; sorted lists."""
     found = {}
+    gc.unfreeze()  # else they are not listed
     for kernel in [kernel for kernel in gc.get_objects() if isinstance(kernel, wp.Kernel)]:
         for block_dim in {block_dim for _, block_dim in getattr(kernel.module, "execs", {})}:
             try:
@@ -232,6 +233,7 @@ def serve(device, quick):
         if what == "prepare":
             runs.clear()
             gc.collect()
+            gc.freeze()  # what is left stays, and need not be looked at again
             with testing.regime(cpu_threads=1):
                 runs["launch"] = launch = (calls | made)[name]()  # a graph holds none of its arrays
                 if name in calls:

@@ -140,7 +140,7 @@ def orient2d(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
     size = wp.abs(left) + wp.abs(right)
     sign = filtered_sign(left - right, BOUND_2D * size)
     if sign == UNCERTAIN:
-        if a == b or a == c or b == c:
+        if a == b:  # of others that coincide both products are 0
             sign = 0
         elif mode == EXACT:
             sign = resolve_orient2d(a, b, c, size)

@@ -73,10 +73,9 @@ def find_signs(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.ve
 def intersect_exactly(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
     """Return what `intersect_triangles` does by exact signs, the same for neighbouring threads at the same time."""
     signs = find_signs(a0, a1, a2, b0, b1, b2)
-    special = (signs & SIGNS_OF_A) == 0 or (signs & SIGNS_OF_B) == 0
-    if (signs & SIGNS_OF_A) != 0 and have_one_side(signs):
+    if have_one_side(signs):
         return 0
-    if special:
+    if (signs & SIGNS_OF_A) == 0 or (signs & SIGNS_OF_B) == 0:
         return wp.where(intersect_special(EXACT, a0, a1, a2, b0, b1, b2), 1, 0)
     a, b = wp.matrix_from_rows(a0, a1, a2), wp.matrix_from_rows(b0, b1, b2)
     p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a, b)

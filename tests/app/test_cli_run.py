@@ -15,9 +15,12 @@ import pytest
 import trimesh
 from helpers.viewer import BODIES, SCENE, write_scene
 from helpers.viewer import run_command as run
+from oracles.motion import posed
+from oracles.triangle import brute_force_faces
 
 import warp_abtree as ab
 from warp_abtree.app import load_scene
+from warp_abtree.app.cli import run_command
 from warp_abtree.app.pictures import command, scenes
 from warp_abtree.app.playback import open_playback
 from warp_abtree.app.styles import COLOURS, STAGE_LABELS
@@ -110,6 +113,57 @@ def count(path, colour, reach=0.12):
     length = np.linalg.norm(image, axis=1)
     near = np.linalg.norm(image / np.maximum(length, 1e-6)[:, None] - np.array(colour) / np.linalg.norm(colour), axis=1)
     return int(np.count_nonzero((near < reach) & (length > 0.15)))
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Panels that would be drawn, without what draws them."""
+    panels = []
+    monkeypatch.setattr(scenes, "draw", lambda found, *_, **__: panels.extend(found))
+    for module in (command, run_command):
+        monkeypatch.setattr(module, "import_pyvista", lambda what: None)
+    return panels
+
+
+def check_panel(panel, scene, objects):
+    """Compare the colours of a panel with the faces of objects, and with those that intersect one another, twice."""
+    meshes = {i: scene.models[scene.object_model[i]].mesh_at(scene.lods[i])[:2] for i in objects}
+    middles = {i: posed(at, scene.poses[i])[faces].mean(axis=1) for i, (at, faces) in meshes.items()}
+    colours, total = {i: COLOURS[scene.object_model[i]] for i in objects}, 0
+    expected = {(i, colours[i][0], 1): middles[i] for i in objects}
+    if len(objects) == 2:
+        i, j = objects
+        hits = brute_force_faces(*meshes[i], *meshes[j], scene.poses[i], scene.poses[j]).T
+        assert hits.shape[1] > 100
+        # A little above each face and below it.
+        expected |= {(k, colours[k][1], 2): middles[k][np.unique(rows)] for k, rows in zip(objects, hits)}
+    for (_, colour, times), points in expected.items():
+        own = panel.triangles[np.abs(panel.colours - colour).max(axis=1) < 0.5 / 255].mean(axis=1)
+        apart, off = np.linalg.norm(own[:, None] - points[None], axis=2), 1e-9 if times == 1 else 0.01
+        assert len(own) == times * len(points) and max(apart.min(axis=0).max(), apart.min(axis=1).max()) < off
+        total += len(own)
+    assert total == len(panel.triangles)
+
+
+def test_colours_that_run_draws(scene, drawn):
+    """Of the world and time of the picture, at both ends of the sweep."""
+    write_scene(".", SCENE + "[picture]\ntime = 0.75\n")
+    scene("--frames 2 --picture out.png")
+    loaded = load_scene("scene.toml", device="cpu")
+    finest, coarsest = scenes.panel_lods(loaded)
+    assert len(drawn) == 2 and len(drawn[0].triangles) > len(drawn[1].triangles) and (finest >= coarsest).all()
+    loaded.scene.set_lods(coarsest)
+    loaded.scene.set_poses(loaded.motion.poses(0.75))
+    check_panel(drawn[1], loaded.scene, [0, 1])
+
+
+@pytest.mark.parametrize(("world", "objects"), [(0, [0, 1]), (2, [3])])
+def test_picture_of_a_world_of_a_scene_file(tmp_path, monkeypatch, capsys, drawn, world, objects):
+    monkeypatch.chdir(tmp_path)
+    write_scene(tmp_path)
+    shown = run(capsys, "picture", "scene.toml", "--world", world, "--json", "--out", "x.png", "--device", "cpu")[0]
+    assert json.loads(shown) == {"picture": "x.png", "objects": len(objects), "frame": 0}
+    check_panel(*drawn, load_scene("scene.toml", device="cpu").scene, objects)
 
 
 @pytest.fixture

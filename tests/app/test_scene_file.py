@@ -235,6 +235,7 @@ LIMITS = {
         (FLAT + "[dynamics]\n", "scene.toml: objects: model 'm' is flat"),
         (LOOK, "camera: the key 'target' is missing"),
         (LOOK + "target = [0, 0, 1]\n", "camera: the camera looks at its own eye"),
+        (LOOK + "target = [0, 0, 0]\nup = [0, 0, 0]\n", "camera.up: a direction of no length"),
         (LOOK + KEY, "camera: give eye and target, or"),
         (ONE + 2 * KEY, "camera.keys[1].time: 0.0 is not after"),
         # Numbers that overflow.

@@ -1,5 +1,6 @@
 """The gate between two trees and its worker, and the history of times: what differs, and what is named slower."""
 
+import gc
 import io
 import json
 import sys
@@ -7,7 +8,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import warp as wp
 
+import warp_abtree as ab
 from bench import __main__ as main
 from bench.gate import compare, worker
 from bench.studies import nightly
@@ -67,6 +70,16 @@ def test_digests_tell_arrays_apart():
     zeros = np.zeros(2, np.float64)
     assert len({digest([a]) for a in (zeros, -zeros, zeros.astype(np.float32), zeros[:1], zeros.reshape(1, 2))}) == 5
     assert digest([zeros]) == digest([np.zeros(4)[::2]])
+
+
+def test_kernels_are_listed_that_collections_pass_by(monkeypatch):
+    monkeypatch.setattr(wp, "get_cuda_kernel_properties", lambda *_: {"registers": 8})
+    ab.Scene("cpu").add(ab.Model.from_arrays(np.eye(3), [[0, 1, 2]]))  # loads kernels
+    gc.collect()
+    gc.freeze()
+    found = worker.kernels_of("cpu")
+    gc.freeze()
+    assert found["names"] == ["registers"] and len(found["kernels"]) > 1
 
 
 def line(*times, **about):

@@ -14,6 +14,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.poses import ROUNDING_32
 from warp_abtree.kernels.distance.frame import PAIRS_LEAST
 from warp_abtree.kernels.distance.slab_bound import BOUND_MARGINS
+from warp_abtree.kernels.search.mean_slabs import USES_MIN
 
 # Rows: corners of A and of B, B's quaternion, and how far the first corners are apart: slabs' roundings add up to 5.4
 # times u (r_a + r_b + s) for warps, to 4.2 times that on a CPU, of 45 that margins have.
@@ -132,9 +133,43 @@ def test_margins_of_slabs_cover_roundings_that_add_up(device, case):
         np.testing.assert_allclose(found.distance, distance, rtol=1e-6)
 
 
+def beside_one_another(rng, length=3000.0, reach=1e-2):
+    """Return A, B and the pose of B: each a face at either end of a rod, the ends that are nearest 1 apart across it.
+
+    The four ends' middles join along the rod, so that the nearest are apart across that direction, and their balls are
+    as large as the faces, whose corners lead away from one another.
+    """
+    rod = rng.normal(size=3)
+    rod /= np.linalg.norm(rod)
+    way = np.cross(rod, rng.normal(size=3))
+    way /= np.linalg.norm(way)
+    turn = quaternion_matrix(random_quaternions(rng, 1)[0])
+    aside = reach * np.array([[0, 0], [-1, 1e-4], [-1, -1e-4]]) @ [way, rod]
+    ends = 0.5 * length * rod + aside, (-0.5 * length * rod - aside) @ turn
+    a, b = (ab.Model.from_arrays(np.concatenate([face, -face]), [[0, 1, 2], [3, 4, 5]]) for face in ends)
+    return a, a.lod_max, STILL, b, b.lod_max, to_matrix(turn, length * rod + way)
+
+
+@pytest.mark.parametrize("warps", [None, True], ids=["threads", "warps"])
+def test_margins_of_balls_cover_roundings(device, warps):
+    """Nodes that are apart across the direction in which slabs are compared; without the margin some are lost."""
+    rng = np.random.default_rng(0)
+    cases = [beside_one_another(rng) for _ in range(40)]
+    truths = np.tile([mesh_distance(*case) for case in cases], int(USES_MIN) + 1)
+    pairs = np.tile(pairs_of(cases), (int(USES_MIN) + 1, 1))
+    with testing.regime(warps=warps):
+        query = ab.DistanceQuery(scene_of(device, cases), pairs, beyond=truths * (1 + 1e-9))
+        for _ in range(2):
+            query.run()
+            query.forget()
+        assert (query.stages[-1].slabs.made.numpy()[:, 0] >= 0).sum() == 2 * len(cases)
+        np.testing.assert_allclose(query.run().distance, truths, rtol=1e-6)
+
+
 def test_slabs_leave_off_what_roundings_add_up_to():
     """Those of docs/exactness.md, in u of the reaches of A and of B and of the translation, along n and across it."""
     along, across = (17.6, 26.9, 8.3), (25, 37, 27)
     room = float(BOUND_MARGINS) / 2 * float(ROUNDING_32) / 2.0**-24
     assert room >= max(*along, *across) and int(BOUND_MARGINS) == native.constant("SLAB_MARGINS")
     assert "boxes.margin = SLAB_MARGINS * scaling.margin;" in native.read("distance/search.h")
+    assert native.read("distance/slab_bounds.h").count(" - margin)") == 3  # along n, across it, along a node's own

@@ -16,6 +16,9 @@ from oracles.triangle import into_frame_of_a, quaternion_matrix, triangles_inter
 
 import warp_abtree as ab
 from warp_abtree.kernels import native
+from warp_abtree.kernels.base.arrays import Trees
+from warp_abtree.kernels.base.poses import pair_pose
+from warp_abtree.kernels.distance.frame import make_scale
 from warp_abtree.kernels.exact.predicates import UNCERTAIN
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, side_of_plane
 
@@ -199,3 +202,41 @@ def test_the_bound_of_determinants_covers_roundings_that_add_up(device):
     sides = launch(side_kernel, device, len(points), points)
     sure = sides != int(UNCERTAIN)
     np.testing.assert_array_equal(sides[sure], true_signs(points)[sure])
+
+
+@wp.kernel
+def margin_kernel(trees: Trees, margins_out: wp.array2d[wp.float64]):
+    """Write the margin of an object pair's boxes, its float32 coordinates' error, and the margin of their distance."""
+    i = wp.tid()
+    pose = pair_pose(False, trees, 2 * i, 2 * i + 1, wp.float64(0.0))
+    scaling = make_scale(trees, pose, 2 * i, 2 * i + 1)
+    margins_out[i, 0] = wp.float64(pose.margin)
+    margins_out[i, 1] = wp.float64(pose.error) / pose.scale
+    margins_out[i, 2] = wp.float64(scaling.margin) / wp.float64(scaling.scale)
+
+
+def test_margins_have_what_roundings_add_up_to(device):
+    """Those of docs/exactness.md, of objects far from their own origins, from one another, or neither, and large."""
+    rng, cases, most = np.random.default_rng(8), [], []
+    for k in range(64):
+        far, size = 2.0 ** rng.choice([-4, 0, 24, 32], 2), 2.0 ** rng.choice([-20, 0], 2)
+        centre_a, centre_b = (rng.normal(size=3) * f for f in far)
+        turn = quaternion_matrix(random_quaternions(rng, 1)[0])
+        apart = size.max() * rng.normal(size=3) * (k % 3)
+        shift = centre_a - turn @ centre_b + apart
+        a, b = (
+            ab.Model.from_arrays(c + s * rng.uniform(-1, 1, (3, 3)), FACE) for c, s in zip((centre_a, centre_b), size)
+        )
+        cases.append((a, None, STILL, b, None, to_matrix(turn, shift)))
+        reach_a, reach_b = (np.abs(m.mesh_at(m.lod_max)[0] - m.centre).max() for m in (a, b))
+        at_b, whole = np.abs(b.centre).max(), (np.abs(shift) + np.abs(a.centre)).max()
+        s = np.abs(turn @ b.centre + shift - a.centre).max()
+        exact = 2.0**-53 * (44 * at_b + 22 * reach_b + 15 * whole)  # bound 9 leaves no more of a unit quaternion
+        boxes = U * max(8.94 * reach_b + 5 * s + 2 * reach_a, 8.94 * reach_a + 8.66 * s + 2 * reach_b)
+        corners = U * (3.9 * reach_a + 22.2 * reach_b + 6.1 * s)
+        most.append((boxes + exact, corners + 2 * exact, boxes + exact))
+    trees = scene_of(device, cases).batch().trees
+    margins = launch(margin_kernel, device, len(cases), trees, columns=3)
+    near = np.isfinite(margins[:, 0])  # others are apart for certain
+    margins, most = margins[near], np.array(most)[near]
+    assert near.sum() > 40 and (margins >= most).all() and (margins < 8 * most).all()

@@ -59,6 +59,26 @@ def test_sums_and_products_lose_nothing(device, kind):
     assert [Fraction(h) + Fraction(t) for h, t in zip(high.tolist(), low.tolist())] == exact
 
 
+@wp.kernel
+def add_words_kernel(a: wp.array[wp.vec2d], b: wp.array[wp.vec2d], sum_out: wp.array[wp.vec2d]):
+    i = wp.tid()
+    sum_out[i] = add_double(a[i], b[i])
+
+
+def test_sums_of_double_words_keep_their_bound(device):
+    """Of words of either sign whose high words cancel, whole or but for some units in the last place."""
+    rng = np.random.default_rng(2)
+    high = random_floats(rng, 800, -40, 40)
+    other = np.where(rng.random(800) < 0.7, -high, random_floats(rng, 800, -40, 40))
+    other += rng.integers(-2, 3, 800) * np.spacing(other) * (rng.random(800) < 0.5)
+    words = [np.stack([x, random_floats(rng, 800, -9, -1) * np.spacing(np.abs(x))], 1) for x in (high, other)]
+    found = launch(add_words_kernel, device, 800, *words)
+    for got, a, b in zip(found.tolist(), *(w.tolist() for w in words)):
+        exact = sum(map(Fraction, (*a, *b)))
+        assert abs(sum(map(Fraction, got)) - exact) <= abs(exact) * (3 + Fraction(13, 2**53)) / 2**106
+        assert got[0] + got[1] == got[0]
+
+
 STAGES = ("filter", "float32", "exact", "long", "integer", "double")  # the first three by their modes
 
 
@@ -171,14 +191,24 @@ def tied_points(rng, dim):
     rows = np.eye(3)[None] * rng.choice([1.0, -1.0], (COUNT, 1, 1))
     rows[:, 0, 0] = 2.0**53 - rng.integers(0, 3, COUNT)
     rows[:, 0, 1], rows[:, 1, 0] = rng.choice([0.25, 0.5, 1.0, 1.5], COUNT), rng.choice([-1.0, 1.0, 3.0], COUNT)
-    rows[:, 0, 2], rows[:, 2, 0] = 2.0 ** -rng.integers(0, 70, COUNT), rng.choice([0.0, 1.0, -1.0], COUNT)
+    rows[:, 0, 2], rows[:, 2, 0] = 2.0 ** -rng.integers(0, 220, COUNT), rng.choice([0.0, 1.0, -1.0], COUNT)
     return np.concatenate([rows, np.zeros((COUNT, 1, 3))], 1)
 
 
-@pytest.mark.parametrize("kind", [*KINDS, "spread", "tied"])
+def word_points(rng, dim):
+    """Determinants of whole rows that end with so many zeros that the lowest words of 64 bits hold nothing."""
+    points = np.zeros((COUNT, 4, 3))
+    points[:, :3, 2] = 1.0
+    for k in range(2):
+        points[:, k, k] = rng.choice([1.0, -1.0, 3.0], COUNT) * 2.0 ** rng.integers(20, 80, COUNT)
+    return points
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "spread", "tied", "words"])
 def test_determinants_are_rounded_once_or_a_few_times(device, kind):
     """Once to nearest, ties to even, as Python rounds fractions; expansions with a few roundings more."""
-    points = {**KINDS, "spread": spread_points, "tied": tied_points}[kind](np.random.default_rng([8, 3]), 3)
+    kinds = {**KINDS, "spread": spread_points, "tied": tied_points, "words": word_points}
+    points = kinds[kind](np.random.default_rng([8, 3]), 3)
     found = launch(volume_kernel, device, len(points), points, columns=3, block_dim=int(EXPANSION_LANES))
     values = [sum(true_terms(rows)) for rows in points.tolist()]
     np.testing.assert_array_equal(found[:, 0], [float(x) for x in values])
@@ -239,6 +269,40 @@ def test_integers_tell_small_determinants(device, kind, form, share):
         assert sign != int(UNCERTAIN) or not small
         told += small
     assert told > 3 or kind == "random"
+
+
+@pytest.mark.parametrize("form", ["2D", "3D"])
+def test_integers_leave_what_128_bits_may_not_hold(device, form):
+    """Determinants about 2^127 units, four times their bound: a sign is right or left open, no smaller one is."""
+    dim, _ = FORMS[form]
+    rng, points = np.random.default_rng(4), np.zeros((COUNT, dim + 1, dim))
+    digits, exponents = rng.integers(1 - 2**53, 2**53, (COUNT, dim, dim)), (8, 13) if dim == 2 else (-11, -8)
+    points[:, :-1] = np.rint(digits * 2.0 ** rng.integers(*exponents, (COUNT, dim, dim)))
+    points[:, range(dim), range(dim)] = 1.0  # the unit of each row
+    values = [sum(true_terms(rows)) for rows in points.tolist()]
+    bound = [np.nextafter(float(abs(x) / 4), np.inf) for x in values]
+    found, counts = ask(device, form, points, bound)["integer"], [0, 0]
+    for rows, value, sign in zip(points.tolist(), values, found):
+        assert sign in ((value > 0) - (value < 0), int(UNCERTAIN))
+        size = abs(value) / Fraction(2) ** unit_of(rows)
+        assert sign != int(UNCERTAIN) or size > 2**124
+        counts[0] += size > 2**127
+        counts[1] += sign != int(UNCERTAIN)
+    assert min(counts) > 20, counts
+
+
+@pytest.mark.parametrize("form", ["2D", "3D"])
+def test_integers_wrap(device, form):
+    """2^e m - 1 and 2^64 over 2^(e - 64) m - 1 and 1: 2^64 - 1, whatever of the first is beyond 128 bits."""
+    dim, _ = FORMS[form]
+    exponents = np.arange(64, 200)
+    points, m = np.zeros((len(exponents), dim + 1, dim)), 2.0**52 + 1
+    points[:, 0, 0], points[:, 1, 0], points[:, dim, 0] = m * 2.0**exponents, m * 2.0 ** (exponents - 64), 1.0
+    points[:, 0, 1], points[:, 1, 1] = 2.0**64, 1.0
+    if form == "3D":
+        points[:, 2] = 1.0, 0.0, 1.0
+    found = ask(device, form, points, np.full(len(points), 2.0**62))["integer"]
+    assert (found == 1).all() and (true_signs(points) == 1).all()
 
 
 @pytest.mark.parametrize("form", ["2D", "3D"])

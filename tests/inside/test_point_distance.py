@@ -1,5 +1,6 @@
 """Distances of points from a model and sides of closed ones, against fractions, integers and brute force."""
 
+import gc
 from fractions import Fraction
 
 import numpy as np
@@ -249,3 +250,18 @@ def test_points_of_a_gpu_stay_there():
         points[[40_000, 60_000], 1] = bad
         rows = wp.array(points, dtype=wp.vec3d, device="cuda:0")
         refused(ValueError, f"point 40000 {what}", ab.signed_distance, model, rows)
+
+
+def test_what_is_kept_is_bounded_and_goes_with_its_models(device, monkeypatch):
+    monkeypatch.setattr(point_distance, "_kept", kept := {})
+    cube = voxel_mesh([(0, 0, 0)])
+    models = [model_of(cube) for _ in range(point_distance.KEPT_MODELS + 1)]
+    for model in models:
+        ab.contains(model, [(0.5, 0.5, 0.5)], device=device)
+    assert [key[0] for key in kept] == [id(model) for model in models[1:]]
+    batch = kept[next(iter(kept))][0]
+    assert ab.contains(models[1], [(0.5, 0.5, 0.5)], device=device).all()
+    assert [key[0] for key in kept][-1] == id(models[1]) and [*kept.values()][-1][0] is batch, "asked last"
+    del models[2:], model
+    gc.collect()
+    assert [key[0] for key in kept] == [id(models[1])]

@@ -113,6 +113,34 @@ def test_contacts_keep_their_order_as_bodies_move(device, monkeypatch):
             np.testing.assert_array_equal(one, two)
 
 
+def test_a_launch_reads_the_poses_of_its_state(device, monkeypatch):
+    """The rows are those of a `collide` at these poses; before the first call objects stand where the model's are."""
+    monkeypatch.setattr(newton, "CollisionPipeline", PairContacts)
+    model = ring_model(device, 2)
+    found = ab.NewtonContacts(model)
+    bodies, shapes = model.shape_body.numpy()[found.shapes], model.shape_transform.numpy()[found.shapes]
+    for pose, body, shape in zip(found.scene.poses, bodies, shapes):
+        expected = (
+            wp.transform(*shape) if body < 0 else wp.transform(*model.body_q.numpy()[body]) * wp.transform(*shape)
+        )
+        np.testing.assert_allclose(pose, expected, atol=1e-6)
+    state, there, contacts = model.state(), model.state(), found.contacts()
+    moved = there.body_q.numpy().copy()
+    moved[-1, :2] += np.float32(0.03)
+    there.body_q.assign(moved)
+    found.collide(state, contacts)
+    at_first = contact_rows(contacts, *COLUMNS)
+    found.query.forget()
+    found.launch(there, contacts)
+    rows = contact_rows(contacts, *COLUMNS)
+    _, other, expected = collided(model)
+    other.query.forget()
+    other.collide(there, expected)
+    for one, two in zip(rows, contact_rows(expected, *COLUMNS), strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert len(rows[0]) != len(at_first[0]) or any((a != b).any() for a, b in zip(rows, at_first))
+
+
 @pytest.mark.filterwarnings("ignore:Model.request_contact_attributes")  # deprecated, but what Isaac Lab 3.0 calls
 @pytest.mark.parametrize("others", [False, True])
 def test_a_loop_as_isaac_labs(device, monkeypatch, others):

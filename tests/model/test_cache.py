@@ -4,6 +4,7 @@ import gzip
 import json
 import os
 import shutil
+import stat
 import struct
 
 import numpy as np
@@ -140,6 +141,12 @@ def test_small_models_and_those_beyond_the_limit_are_not_kept(folder, built, bal
     monkeypatch.setattr(cache, "SIZE_LIMIT", 1000)
     ab.Model.load(ball)
     assert len(built) == 3 and not folder.exists()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
+def test_the_folder_is_the_users_alone(folder, ball):
+    ab.Model.load(ball)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
 def test_where_the_folder_is(monkeypatch, tmp_path):

@@ -106,6 +106,29 @@ def test_each_direction_against_brute_force(device, names):
     assert (coarse >= alone.min(1) - 1e-11).all() and (coarse <= alone.min(1) + 0.08).all()
 
 
+def test_no_direction_is_left_out_for_one_hardly_less_deep(device):
+    """Of directions within a hundredth of one another, as little apart in depth, the least is that of each alone."""
+    rng = np.random.default_rng(6)
+    cases = [random_case(rng, names, 60) for names in (("torus", "capsule"), ("three", "torus")) * 8]
+    scene, pairs = scene_of(device, cases), pairs_of(cases)
+    directions = rng.normal(size=(16, 1, 3))
+    directions = directions + 0.01 * np.linalg.norm(directions, axis=2, keepdims=True) * rng.normal(size=(16, 6, 3))
+    alone = np.stack([scene.penetration(pairs, directions[:, [k]], FINE).depth for k in range(6)], 1)
+    least = scene.penetration(pairs, directions, FINE)
+    np.testing.assert_array_equal(least.depth, alone.min(1))
+    assert (alone[:, 0] > alone.min(1)).sum() > 6
+
+
+def test_directions_along_which_objects_still_meet_are_not_searched(device, monkeypatch):
+    """Of 34 the few along which boxes overlap least, and what is free of contact at the depth that they have."""
+    searched, find = [], penetration._Approaches.find_depths
+    count = lambda self, asked, tolerance: (searched.append(asked.sum()), find(self, asked, tolerance))[1]  # noqa: E731
+    monkeypatch.setattr(penetration._Approaches, "find_depths", count)
+    scene = scene_with(device, (block(12, 12, 1), (0, 0, 0, 0, 0, 0, 1)), (block(1, 1, 10), (0, 0, 0, 0, 0, 0, 1)))
+    assert scene.penetration([(0, 1)]).depth == pytest.approx(5.5, abs=2e-5)
+    assert sum(searched) <= 6
+
+
 def random_overlaps(rng, count, far):
     """Return models of boxes, poses (2 count, 7) at which most pairs overlap, and posed corners (2 count, 8, 3)."""
     models = [block(*rng.uniform(0.2, 1.5, 3), about=rng.uniform(-0.2, 0.2, 3)) for _ in range(2 * count)]

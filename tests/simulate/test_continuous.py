@@ -11,7 +11,9 @@ from helpers.samples import STILL
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
+from warp_abtree import testing
 from warp_abtree.query.request import Buffers, CapacityError
+from warp_abtree.simulate import continuous
 from warp_abtree.simulate.body_state import mass_properties
 
 SHEET = box(0.4, 0.4, 0.001)
@@ -150,6 +152,54 @@ def test_a_step_without_room_for_pairs_moves_nothing_and_says_so(device):
     refused(CapacityError, "Buffers\\(pairs=", dynamics.check)
     dynamics.finish(1 / 60)
     assert not np.array_equal(dynamics.poses(), before) and not surfaces_meet(dynamics)
+
+
+def test_a_search_again_begins_at_the_goals(device):
+    """Where the faces of boxes that touch outnumber the room, ways are found again, not those cut short cut again."""
+
+    def shoot(**room):
+        placed = [(BRICK, (0, 0, z, 0, 0, 0, 1)) for z in (0, 0.5)]
+        placed += [(SHEET, (5, 0, 0, 0, 0, 0, 1), True), (BULLET, (5.03, 0.02, 0.3, 0, 0, 0, 1))]
+        dynamics = make(device, *placed, velocity=[(0, 0, 0)] * 3 + [(0, 0, -30.0)], continuous=True, **FREE)
+        dynamics.certified.make_room(**room)
+        before = dynamics.certified.rooms.uncertain
+        dynamics.step(1 / 60)
+        assert dynamics.certified.pair_totals()["touching"] == 1
+        return bits(dynamics), dynamics.certified.fraction.numpy(), dynamics.certified.rooms.uncertain > before
+
+    with testing.regime(warps=True):
+        expected, fraction, grown = shoot()
+        found, fraction_again, grown_again = shoot(uncertain=1)
+    assert grown_again and not grown and 0 < fraction[3] < 1
+    np.testing.assert_array_equal(fraction_again, fraction)
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("shared", ["nothing", "a floor", "a body"])
+def test_what_stays_open_holds_its_world(device, shared):
+    """A row of boxes fast behind one another, the first before a wall: too many to be cut one after the other.
+
+    A body that is in both worlds holds them together, since it was proved clear of where the held ones would be.
+    """
+    scene, count = ab.Scene(device), len(continuous.ROUNDS) + 2
+    for k in range(count):
+        scene.add(BRICK, (1.01 * k, 0, 0, 0, 0, 0, 1), world=0)
+    scene.add(BRICK, (-1.01, 0, 0, 0, 0, 0, 1), world=0, static=True)
+    alone = scene.add(BRICK, (0, 9, 0, 0, 0, 0, 1), world=1)
+    if shared != "nothing":
+        scene.add(BRICK, (0, -9, 0, 0, 0, 0, 1), world=-1, static=shared == "a floor")
+    dynamics = ab.Dynamics(scene, continuous=True, **FREE)
+    dynamics.step(1 / 60)
+    certified, before = dynamics.certified, dynamics.poses()
+    goals = certified.goals.position.numpy()
+    goals[dynamics.rigid, 0] -= 0.5
+    certified.goals.position.assign(goals)
+    certified.launch()
+    certified.end((0, 0, 0))
+    assert certified.pair_totals()["held"] > 0 == certified.pair_totals()["touching"]
+    moved = certified.fraction.numpy() > 0
+    np.testing.assert_array_equal((scene.poses != before).any(1), moved)
+    assert not moved[:count].any() and moved[alone] == (shared != "a body") and not moved[alone + 1 :].any()
 
 
 def test_what_is_undecided_waits_and_is_no_error(device):

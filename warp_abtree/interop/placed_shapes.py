@@ -103,12 +103,15 @@ class PlacedShapes:
         size = np.linalg.norm(middle, axis=1) + np.linalg.norm(half, axis=1)
         skew = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0)
         # Rounding of terms that may cancel, and of a frame that is off orthonormal, as in the broad phase.
-        pad = 3 * skew * size + 1e-12 * (size + np.abs(position).max(1, initial=0))
+        skew *= 3
+        pad = skew * size + 1e-12 * (size + np.abs(position).max(1, initial=0))
         middle = np.einsum("nij,nj->ni", rotation, middle) + position
         half = np.einsum("nij,nj->ni", np.abs(rotation), half)
-        half = half * (1 + 1e-9) + pad[:, None]
+        half = half + pad[:, None]
         i, j = pairs.T
-        return np.linalg.norm(np.maximum(np.abs(middle[i] - middle[j]) - half[i] - half[j], 0), axis=1)
+        gaps = np.linalg.norm(np.maximum(np.abs(middle[i] - middle[j]) - half[i] - half[j], 0), axis=1)
+        # Distances are those in the frame of either, which may be shorter.
+        return gaps * (1 - np.maximum(skew[i], skew[j]))
 
     def find_likely(self, pairs, gaps) -> int:
         """Return the index of the pair that has the nearest corners, which bounds the least distance of all."""

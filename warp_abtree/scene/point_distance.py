@@ -24,6 +24,7 @@ from warp_abtree.model.winding import check_solid
 from warp_abtree.query.request import check_within
 from warp_abtree.scene.objects import check_models
 from warp_abtree.scene.posed_objects import PosedObjects
+from warp_abtree.state.batch import Batch
 
 # Points of a thread of the CPU: the next starts from the last one's nearest face.
 RUN = 256
@@ -67,10 +68,9 @@ def signed_distance(
     return_nearest, lod = flag(nearest, "nearest"), model.lod_max if lod is None else model.check_lod(lod)
     if _is_on_gpu(points):
         device = points.device if device is None else device
-    scene = _find_scene(model, lod, device)
-    check_device(scene.device, "ab.signed_distance")
+    batch = _find_batch(model, lod, device)
     names = ("distance", "nearest", "face") if return_nearest else ("distance",)
-    found = _measure(scene, [(0, signed)], points, within, names)
+    found = _measure(batch, [(0, signed)], points, within, names)
     return found if return_nearest else found[0]
 
 
@@ -92,13 +92,14 @@ def object_distances(scene: PosedObjects, points, world, signed, within, nearest
         raise ValueError(
             f"signed: no object of world {world} is a solid; give solid=True to Scene.add, or signed=False"
         )
-    return _measure(scene, np.column_stack([objects, solid]), points, within, [*OUTPUTS][: None if nearest else 2])
+    asked, names = np.column_stack([objects, solid]), [*OUTPUTS][: None if nearest else 2]
+    return _measure(scene.batch(), asked, points, within, names)
 
 
-def _measure(scene, asked, points, within, names) -> tuple:
-    """Return outputs of points from objects of a scene, rows of (object, whether it has an inside), by their names."""
+def _measure(batch: Batch, asked, points, within, names) -> tuple:
+    """Return outputs of points from objects of a batch, rows of (object, whether it has an inside), by their names."""
     most = np.inf if within is None else float(check_within(within, known="points: one distance for all"))
-    batch, device, stays = scene.batch(), scene.device, _is_on_gpu(points)
+    device, stays = batch.device, _is_on_gpu(points)
     if stays and points.device != device:
         raise ValueError(f"points: on {points.device}, the model or scene is on {device}")
     rows, bounds = _bound_on_gpu(points) if stays else _bound_on_host(points, device)
@@ -183,14 +184,16 @@ def _sort(rows: wp.array, bounds: wp.array) -> wp.array:
     return order
 
 
-def _find_scene(model, lod, device) -> PosedObjects:
-    """Return a scene of one object at an LOD, which is kept while its model lives, or three others are asked."""
+def _find_batch(model, lod, device) -> Batch:
+    """Return the batch of one object at an LOD, which is kept while its model lives, or three others are asked."""
     scene = PosedObjects(device)
+    check_device(scene.device, "ab.signed_distance")
     key = id(model), lod, scene.device.alias
     kept = _kept.pop(key, None)
     if kept is None:
         scene.add(model, lod=lod)
-        kept = scene, weakref.ref(model, lambda _: _kept.pop(key, None))
+        # Not the scene, which holds its models.
+        kept = scene.batch(), weakref.ref(model, lambda _: _kept.pop(key, None))
     _kept[key] = kept
     for old in list(_kept)[:-KEPT_MODELS]:
         _kept.pop(old, None)

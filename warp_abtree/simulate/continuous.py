@@ -29,12 +29,11 @@ class MotionRounds(FirstContactStage):
     Attributes:
         goals: As of `CertifiedMotions`.
         state: `kernels.StepMotions`.
-        is_begun: Whether `begin` was launched since the last rounds.
     """
 
     def __init__(self, bodies):
         super().__init__(TIME_TOLERANCE)
-        self._bodies, self.goals, self.state, self.is_begun = bodies, ObjectPool(), kernels.StepMotions(), False
+        self._bodies, self.goals, self.state = bodies, ObjectPool(), kernels.StepMotions()
 
     def attach(self, operator: Operator):
         """Take the operator."""
@@ -59,15 +58,12 @@ class MotionRounds(FirstContactStage):
         """Aim all motions at their goals, whole. Launches only."""
         inputs = [self._pool, self._bodies, self.state]
         self.launch(kernels.begin_way_kernel, len(self.state.fraction), inputs)
-        self.is_begun = True
 
     def search(self):
         """Cut the motions. Launches only."""
         operator, bodies, state = self.operator, self._bodies, self.state
         room, n, found, hits = len(operator.pairs), len(state.fraction), operator.pair_batch, operator.hits
-        if not self.is_begun:  # a search again, with more room
-            self.begin()
-        self.is_begun = False
+        self.begin()  # again, where a search without room has cut motions
         self.launch(kernels.exempt_pair_kernel, room, [found, hits, bodies, state])
         for mode in ROUNDS:
             self.launch(kernels.choose_pair_kernel, room, [found, state, hits])

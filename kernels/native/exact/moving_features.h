@@ -94,11 +94,12 @@ struct MovingFeatures {
         }
         return sign_of(gap, 8, n.largest() * error) != 0;
     }
-    // Return a direction halfway: the normal; of edges that are nearly parallel, that of their plane; or an edge.
+    // Return a direction halfway: the normal; of edges that are nearly parallel, that of their plane; or an edge, in
+    // place of a first one that is a point the way from there.
     CUDA_CALLABLE Point direction(int k) const {
         const Point a = first[0] + last[0], b = first[1] + last[1], c = first[2] + last[2];
         if (k >= 5)
-            return k == 5 ? a : c - b;
+            return k == 6 ? c - b : edges && a.largest() == 0.0 ? b : a;
         if (k == 0 || k == 4)
             return edges ? a.cross(c - b) : (b - a).cross(c - a);
         return k == 1 ? a.cross(b) : k == 2 ? b.cross(c) : c.cross(a);
