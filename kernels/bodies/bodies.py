@@ -21,6 +21,8 @@ ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 FREE, STUCK, ON_TRIAL, STUCK_AGAIN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
 """Whether a body's last motion was cut to next to nothing, and what came of it; the odd ones move out of contact."""
 
+ITERATIONS_MAX, CONVERGED = wp.constant(8), wp.constant(wp.float64(1e-32))
+TURN_PARTS, PARTS_MAX, TWELVE = wp.constant(wp.float64(2.0)), wp.constant(wp.float64(32.0)), wp.constant(wp.float64(12.0))
 LOOKAHEAD_LEAST, LOOKAHEAD_MAX = wp.constant(wp.float64(2.0**-8)), wp.constant(wp.float64(0.25))
 """How far ahead of a body contacts are looked for, beside its motion in a step, and motion at most, in its radii."""
 
@@ -55,27 +57,52 @@ class Bodies:
 
 @wp.func
 def rotation_by(v: wp.vec3d):
-    """Return the quaternion of a rotation vector, axis times angle [rad]."""
-    return wp.quat_from_axis_angle(wp.normalize(v), wp.length(v))
+    """Return the quaternion of a rotation vector, axis times twice the tangent of half the angle."""
+    return wp.normalize(wp.quatd(HALF * v[0], HALF * v[1], HALF * v[2], ONE))
+
+
+@wp.func
+def turn_of(m: wp.vec3d, turn: wp.vec3d):
+    """Return the rotation vector, in the body frame, of a free body in a time that keeps its energy and momentum.
+
+    The implicit midpoint rule for the body's momentum m, of length 1, keeps all its quadratic invariants. Where Newton's
+    method does not converge, for turns by more than a radian, a turn about m itself keeps them as well.
+
+    Args:
+        turn: By how much a momentum of 1 about each axis turns the body in the time [rad].
+    """
+    d = HALF * wp.vec3d(turn[2] - turn[1], turn[0] - turn[2], turn[1] - turn[0])
+    x = wp.vec3d(m)
+    iteration, left = wp.int32(0), wp.float64(ONE)
+    while iteration < ITERATIONS_MAX and left > CONVERGED:
+        u, v, w = d[0] * x, d[1] * x, d[2] * x
+        slope = wp.matrix_from_rows(
+            wp.vec3d(ONE, -u[2], -u[1]), wp.vec3d(-v[2], ONE, -v[0]), wp.vec3d(-w[1], -w[0], ONE)
+        )
+        change = wp.inverse(slope) * (m + wp.vec3d(u[1] * x[2], v[2] * x[0], w[0] * x[1]) - x)
+        x += change
+        left = wp.dot(change, change)
+        iteration += 1
+    if left <= CONVERGED:
+        return wp.cw_mul(turn, x)
+    return wp.dot(wp.cw_mul(turn, m), m) * m
 
 
 @wp.func
 def integrate_rotation(q: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d, dt: wp.float64):
-    """Return the rotation of a free body after a time; its angular momentum [world frame] is constant.
-
-    The kinetic energy is split into that of the three axes, each of which gives a plain rotation. Their symmetric
-    product is symplectic: the energy oscillates and does not drift.
-    Source: McLachlan 1993, Explicit Lie-Poisson integration and the Euler equations; Reich 1994.
-    """
-    m = wp.quat_rotate_inv(q, momentum)
-    for k in range(5):
-        axis = wp.where(k < 3, k, 4 - k)
-        part = wp.where(k == 2, dt, HALF * dt)
-        v = wp.vec3d()
-        v[axis] = part * m[axis] * inverse_moment[axis]
-        turn = rotation_by(v)
-        q = q * turn
-        m = wp.quat_rotate_inv(turn, m)
+    """Return the rotation of a free body after a time; its angular momentum [world frame] and energy are constant."""
+    size = wp.length(momentum)
+    if size == ZERO:
+        return q
+    turn = dt * size * inverse_moment
+    m = wp.quat_rotate_inv(q, momentum / size)
+    angle = wp.length(wp.cw_mul(turn, m))
+    parts = wp.int32(wp.clamp(TURN_PARTS * angle, ONE, PARTS_MAX))
+    for _ in range(parts):
+        # Of which half the angle's tangent is about what it is to be.
+        part = wp.min(angle / wp.float64(parts), ONE)
+        m = wp.quat_rotate_inv(q, momentum / size)
+        q = q * rotation_by(turn_of(m, ((ONE + part * part / TWELVE) / wp.float64(parts)) * turn))
     return wp.normalize(q)
 
 
@@ -137,6 +164,8 @@ def move_bodies_kernel(h: wp.float64, bodies_inout: Bodies):
         q = bodies_inout.rotation[i]
         bodies_inout.position[i] += h * bodies_inout.velocity[i]
         bodies_inout.rotation[i] = integrate_rotation(q, momentum, bodies_inout.inverse_moment[i], h)
+        r = wp.quat_to_matrix(bodies_inout.rotation[i])
+        bodies_inout.inverse_inertia[i] = r * wp.diag(bodies_inout.inverse_moment[i]) * wp.transpose(r)
 
 
 @wp.func
