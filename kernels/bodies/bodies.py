@@ -22,7 +22,11 @@ FREE, STUCK, ON_TRIAL, STUCK_AGAIN = wp.constant(0), wp.constant(1), wp.constant
 """Whether a body's last motion was cut to next to nothing, and what came of it; the odd ones move out of contact."""
 
 ITERATIONS_MAX, CONVERGED = wp.constant(8), wp.constant(wp.float64(1e-32))
-TURN_PARTS, PARTS_MAX, TWELVE = wp.constant(wp.float64(2.0)), wp.constant(wp.float64(32.0)), wp.constant(wp.float64(12.0))
+TURN_PARTS, PARTS_MAX, TWELVE = (
+    wp.constant(wp.float64(2.0)),
+    wp.constant(wp.float64(32.0)),
+    wp.constant(wp.float64(12.0)),
+)
 LOOKAHEAD_LEAST, LOOKAHEAD_MAX = wp.constant(wp.float64(2.0**-8)), wp.constant(wp.float64(0.25))
 """How far ahead of a body contacts are looked for, beside its motion in a step, and motion at most, in its radii."""
 

@@ -41,6 +41,9 @@ CUT, MATCH, HOLD_BOTH, CERTIFY = wp.constant(0), wp.constant(1), wp.constant(2),
 """What a round does with pairs that are not clear: cut ways at the time of contact, cut the larger fraction to the
 smaller, cut both at the start, or hold the world."""
 
+TIME_TOLERANCE = wp.constant(wp.float64(2.0**-24))
+"""Of times of first contacts, as a fraction of a way."""
+
 NEAR, VERY_NEAR = wp.constant(wp.float64(0.25)), wp.constant(wp.float64(1.0 / 32.0))
 EXEMPT, LAST_LEVEL = wp.constant(-1), wp.constant(2)
 
@@ -186,6 +189,13 @@ def cut_way_kernel(
     if contacts.end[p] == CLEAR:
         return
     a, b = batch.pairs[p][0], batch.pairs[p][1]
+    length = way_length(objects, motions_inout, bodies, a) + way_length(objects, motions_inout, bodies, b)
+    back = NEAR * slop_of(bodies, batch.pairs[p])
+    if mode <= MATCH and contacts.time[p] <= TIME_TOLERANCE and TIME_TOLERANCE * length > back:
+        # Too long a way to tell where on it they meet: the next round searches the part that they meet on.
+        wp.atomic_min(motions_inout.cut, a, wp.float64(2.0) * TIME_TOLERANCE)
+        wp.atomic_min(motions_inout.cut, b, wp.float64(2.0) * TIME_TOLERANCE)
+        return
     if mode <= MATCH and contacts.time[p] == ZERO and motions_inout.level[p] < LAST_LEVEL:
         motions_inout.level[p] += 1
         motions_inout.is_again[p] = 1
@@ -203,8 +213,6 @@ def cut_way_kernel(
         wp.atomic_min(motions_inout.cut, b, ZERO)
         return
     # A quarter of a slop before the contact, where contacts ahead find it.
-    length = way_length(objects, motions_inout, bodies, a) + way_length(objects, motions_inout, bodies, b)
-    back = NEAR * slop_of(bodies, batch.pairs[p])
     fraction = wp.max(contacts.time[p] - back / wp.max(length, back), ZERO)
     fraction_a, fraction_b = motions_inout.fraction[a], motions_inout.fraction[b]
     less, more = wp.min(fraction_a, fraction_b), wp.max(fraction_a, fraction_b)

@@ -170,6 +170,16 @@ def friction_of(a: Side, b: Side, point: RelaxedPoint, most: wp.float32, slide: 
 
 
 @wp.func
+def half_shift(p: wp.int32, pair: wp.vec2i, constraints: Constraints, bodies: Bodies):
+    """Return half of how far the second object of a pair has moved more than the first, cut to the bounding radius.
+
+    So no impulse acts far off bodies that a step takes far.
+    """
+    shift, most = HALF * (bodies.moved[pair[1]] - bodies.moved[pair[0]]), constraints.slop[p] / SLOP
+    return wp.min(most / wp.max(wp.length(shift), most), ONE) * shift
+
+
+@wp.func
 def load_point(
     relaxation: Relaxation,
     units: Units,
@@ -188,7 +198,8 @@ def load_point(
     a, b, slop = pair[0], pair[1], constraints.slop[p]
     n, first_a, first_b = manifolds.normal[p, k], constraints.arm_a[p, k], constraints.arm_b[p, k]
     shift = bodies.moved[b] - bodies.moved[a]
-    arm_a, arm_b = first_a + HALF * shift, first_b - HALF * shift
+    half = half_shift(p, pair, constraints, bodies)
+    arm_a, arm_b = first_a + half, first_b - half
     moved = shift + wp.cross(bodies.turned[b], first_b) - wp.cross(bodies.turned[a], first_a)
     room = relaxation.rest * slop - manifolds.depth[p, k] + wp.dot(n, moved)
     velocity = velocity_at(bodies, b, arm_b) - velocity_at(bodies, a, arm_a)

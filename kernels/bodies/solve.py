@@ -32,6 +32,7 @@ from warp_abtree.kernels.bodies.relaxed_points import (
     Units,
     act_at_point,
     add_of_lanes,
+    half_shift,
     load_point,
     load_side,
     make_units,
@@ -149,7 +150,7 @@ def apply_impulses(
 ):
     """Write the impulses of a pair's points, and give both objects what is new of them: no momentum is lost."""
     count, unit = manifolds.count[p], units.impulse
-    half = HALF * (bodies.moved[pair[1]] - bodies.moved[pair[0]])
+    half = half_shift(p, pair, constraints, bodies)
     total = PairImpulse()
     for first in range(0, count, warp_size()):
         own, k = PairImpulse(), first + resolve_lane()
@@ -179,7 +180,7 @@ def hand_on_impulses(p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constrai
     These are not what the next substep needs: little of them may lift a body.
     """
     count, struck = manifolds.count[p], constraints.is_struck[p]
-    half = HALF * (bodies.moved[pair[1]] - bodies.moved[pair[0]])
+    half = half_shift(p, pair, constraints, bodies)
     total = PairImpulse()
     for first in range(0, count, warp_size()):
         own, k = PairImpulse(), first + resolve_lane()

@@ -12,7 +12,6 @@ from warp_abtree.query.stages.intersect import IntersectStage
 from warp_abtree.query.stages.motion import FirstContactStage
 from warp_abtree.scene.scene import Scene
 
-TIME_TOLERANCE = 2.0**-24  # of times, as a fraction of a step's motion
 INTEGERS = [(name, wp.int32) for name in ("is_changed", "is_held")]
 SOLVED = [(name, wp.vec3d) for name in ("solved", "solved_momentum")]
 ROUND_MODES = kernels.CUT, kernels.MATCH, kernels.HOLD_BOTH, kernels.CERTIFY
@@ -33,7 +32,7 @@ class MotionRounds(FirstContactStage):
     """
 
     def __init__(self, bodies):
-        super().__init__(TIME_TOLERANCE)
+        super().__init__(float(kernels.TIME_TOLERANCE))
         self._bodies, self.goals, self.state, self.is_begun = bodies, ObjectPool(), kernels.StepMotions(), False
 
     def attach(self, operator: Operator):
