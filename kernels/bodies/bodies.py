@@ -21,7 +21,7 @@ ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 FREE, STUCK, ON_TRIAL, STUCK_AGAIN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
 """Whether a body's last motion was cut to next to nothing, and what came of it; the odd ones move out of contact."""
 
-ITERATIONS_MAX, CONVERGED = wp.constant(8), wp.constant(wp.float64(1e-32))
+ITERATIONS_MAX, CONVERGED = wp.constant(8), wp.constant(wp.float64(2.0**-80))
 TURN_PARTS, PARTS_MAX, TWELVE = (
     wp.constant(wp.float64(2.0)),
     wp.constant(wp.float64(32.0)),
@@ -42,6 +42,7 @@ class Bodies:
     centre: wp.array(dtype=wp.vec3d)  # centre of mass, model frame [world units]
     axes: wp.array(dtype=wp.mat33d)  # principal axes as columns, model frame
     bounding_radius: wp.array(dtype=wp.float64)  # about the centre of mass [world units]
+    slop: wp.array(dtype=wp.float64)  # penetration that matters little [world units]
     position: wp.array(dtype=wp.vec3d)  # of the body frame [world units]
     rotation: wp.array(dtype=wp.quatd)  # of the body frame, x y z w
     velocity: wp.array(dtype=wp.vec3d)  # of the centre of mass [world units/s]
@@ -77,7 +78,7 @@ def turn_of(m: wp.vec3d, turn: wp.vec3d):
     """
     d = HALF * wp.vec3d(turn[2] - turn[1], turn[0] - turn[2], turn[1] - turn[0])
     x = wp.vec3d(m)
-    iteration, left = wp.int32(0), wp.float64(ONE)
+    iteration, left = wp.int32(0), wp.float64(1.0)
     while iteration < ITERATIONS_MAX and left > CONVERGED:
         u, v, w = d[0] * x, d[1] * x, d[2] * x
         slope = wp.matrix_from_rows(
@@ -170,6 +171,17 @@ def move_bodies_kernel(h: wp.float64, bodies_inout: Bodies):
         bodies_inout.rotation[i] = integrate_rotation(q, momentum, bodies_inout.inverse_moment[i], h)
         r = wp.quat_to_matrix(bodies_inout.rotation[i])
         bodies_inout.inverse_inertia[i] = r * wp.diag(bodies_inout.inverse_moment[i]) * wp.transpose(r)
+
+
+@wp.func
+def slop_of(bodies: Bodies, pair: wp.vec2i):
+    return wp.min(bodies.slop[pair[0]], bodies.slop[pair[1]])
+
+
+@wp.func
+def radius_of(bodies: Bodies, pair: wp.vec2i):
+    """Return the smaller bounding radius of two bodies [world units]."""
+    return wp.min(bodies.bounding_radius[pair[0]], bodies.bounding_radius[pair[1]])
 
 
 @wp.func

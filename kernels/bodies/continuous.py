@@ -24,8 +24,8 @@ from warp_abtree.kernels.bodies.bodies import (
     ZERO,
     Bodies,
     rotation_by,
+    slop_of,
 )
-from warp_abtree.kernels.bodies.constraints import SLOP
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, UNDECIDED
 from warp_abtree.kernels.motion.path import Motion, make_path
@@ -137,11 +137,6 @@ def choose_pair_kernel(batch: PairBatch, motions: StepMotions, hits_inout: Hits)
     hits_inout.any_hit[p] = wp.where(changed and motions.level[p] != EXEMPT, 0, 1)
 
 
-@wp.func
-def slop_of(bodies: Bodies, pair: wp.vec2i):
-    return SLOP * wp.min(bodies.bounding_radius[pair[0]], bodies.bounding_radius[pair[1]])
-
-
 @wp.kernel
 def widen_motion_kernel(
     batch: PairBatch,
@@ -191,7 +186,8 @@ def cut_way_kernel(
     a, b = batch.pairs[p][0], batch.pairs[p][1]
     length = way_length(objects, motions_inout, bodies, a) + way_length(objects, motions_inout, bodies, b)
     back = NEAR * slop_of(bodies, batch.pairs[p])
-    if mode <= MATCH and contacts.time[p] <= TIME_TOLERANCE and TIME_TOLERANCE * length > back:
+    is_early = contacts.end[p] != UNDECIDED and contacts.time[p] <= TIME_TOLERANCE
+    if mode <= MATCH and is_early and TIME_TOLERANCE * length > back:
         # Too long a way to tell where on it they meet: the next round searches the part that they meet on.
         wp.atomic_min(motions_inout.cut, a, wp.float64(2.0) * TIME_TOLERANCE)
         wp.atomic_min(motions_inout.cut, b, wp.float64(2.0) * TIME_TOLERANCE)
@@ -283,7 +279,7 @@ def end_way_kernel(
     if not whole:
         return
     fraction = motions.fraction[i]
-    near = NEAR * SLOP * bodies_inout.bounding_radius[i]
+    near = NEAR * bodies_inout.slop[i]
     stuck = fraction < ONE and way_length(objects_inout, motions, bodies_inout, i) < near
     if motions.is_held[motions.world[i]] != 0:
         fraction = ZERO

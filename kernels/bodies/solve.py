@@ -91,7 +91,7 @@ def relax_pair(
     hold the changes of both objects. A pair is struck if it meets fast where a pass begins.
     """
     stage, count, backward, lanes = relaxation.stage, manifolds.count[p], relaxation.backward, warp_size()
-    units = make_units(relaxation.per_substep, constraints.slop[p], pair, bodies)
+    units = make_units(relaxation.per_substep, pair, bodies)
     a, b = load_side(units, bodies, pair[0]), load_side(units, bodies, pair[1])
     change_a, change_b = Change(), Change()
     # Without gravity two rigid bodies are not pushed apart, which would add energy.
@@ -119,8 +119,8 @@ def relax_pair(
             if lanes == 1:
                 point = relaxed[p, k]
             if lanes == 1 or resolve_lane() == k:
-                softens, friction = corrects and struck == 0, wp.float32(relaxation.friction)
-                impulse, more = relax_point(point, a, b, change_a, change_b, softens, friction)
+                friction = wp.float32(relaxation.friction)
+                impulse, more = relax_point(point, a, b, change_a, change_b, corrects, struck, friction)
                 changes = changes or wp.abs(more) > settled * point.mass
                 moment_a = wp.cross(point.arm_a, impulse)
                 moment_b = wp.cross(point.arm_b, impulse)
@@ -150,7 +150,7 @@ def apply_impulses(
 ):
     """Write the impulses of a pair's points, and give both objects what is new of them: no momentum is lost."""
     count, unit = manifolds.count[p], units.impulse
-    half = half_shift(p, pair, constraints, bodies)
+    half = half_shift(pair, bodies)
     total = PairImpulse()
     for first in range(0, count, warp_size()):
         own, k = PairImpulse(), first + resolve_lane()
@@ -180,7 +180,7 @@ def hand_on_impulses(p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constrai
     These are not what the next substep needs: little of them may lift a body.
     """
     count, struck = manifolds.count[p], constraints.is_struck[p]
-    half = half_shift(p, pair, constraints, bodies)
+    half = half_shift(pair, bodies)
     total = PairImpulse()
     for first in range(0, count, warp_size()):
         own, k = PairImpulse(), first + resolve_lane()

@@ -24,7 +24,7 @@ from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT
 from warp_abtree.query.request import Buffers, check_capacity
 from warp_abtree.query.stages.points import POINTS_MAX, ManifoldQuery
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.body_state import RigidBodies
+from warp_abtree.simulate.body_state import SLOP, RigidBodies
 from warp_abtree.simulate.contacts_ahead import AheadGapStage
 from warp_abtree.simulate.continuous import CertifiedMotions
 
@@ -79,7 +79,7 @@ class Dynamics(RigidBodies):
         continuous: bool = False,
         remember: bool | float = False,
     ):
-        super().__init__(scene, gravity, kinematic, velocity, angular_velocity)
+        super().__init__(scene, gravity, kinematic, velocity, angular_velocity, flag(continuous, "continuous"))
         self.friction = float(finite_array(friction, "friction", ()))
         if self.friction < 0:
             raise ValueError(f"friction {friction!r} is below 0")
@@ -87,10 +87,10 @@ class Dynamics(RigidBodies):
         self._by_color = not self.device.is_cpu if by_color is None else by_color
         self.query = ManifoldQuery(scene, None, capacity, gap=AheadGapStage(scene, self.bodies), remember=remember)
         self.certified = None
-        if flag(continuous, "continuous"):
+        if continuous:
             self.certified = CertifiedMotions(scene, self.bodies, Buffers(pairs=check_capacity(capacity).pairs))
-        radii = self.bodies.bounding_radius.numpy()[self.rigid]
-        self._least_slop = float(constraint_kernels.SLOP) * radii.min(initial=np.inf)
+        slop, radius = self.bodies.slop.numpy(), self.bodies.bounding_radius.numpy()
+        self._least_slop, self._thin_slop = slop.min(initial=np.inf), np.where(slop < SLOP * radius, slop, np.inf)
         # No body is in two pairs of a color; more warps than run at a time would wait.
         warps = RELAXING_WARPS * self.device.sm_count if self.device.is_cuda else len(self.rigid)
         self._color_warps = max(1, min(warps, int(np.count_nonzero(self.rigid))))
@@ -150,9 +150,16 @@ class Dynamics(RigidBodies):
     def substeps(self, dt: float) -> int:
         """Return how many substeps a step has: more the longer it is, and the smaller its smallest body.
 
-        A contact gives by about twice the square of a substep times gravity for each body borne.
+        A contact gives by about twice the square of a substep times gravity for each body borne. Raises ValueError
+        where that is much of the thickness of a thin body, which would pass through what it rests on.
         """
-        wanted = dt * np.sqrt(2.0 * np.linalg.norm(self.gravity) / (GIVE * self._least_slop))
+        pull = dt * np.sqrt(2.0 * np.linalg.norm(self.gravity) / GIVE)
+        wanted, thin = pull / np.sqrt(self._least_slop), pull / np.sqrt(self._thin_slop)
+        if thin.max(initial=0.0) > SUBSTEPS_MAX:
+            name = self.scene.name(int(thin.argmax()))
+            longest = dt * SUBSTEPS_MAX / thin.max()
+            what = f"dt {dt:.3g} is too long for body {name!r}, which is thin: it would fall through others"
+            raise ValueError(f"{what}; use steps of {longest:.2g} at most, or continuous=True")
         return int(np.clip(np.ceil(wanted), SUBSTEPS_LEAST, SUBSTEPS_MAX))
 
     def find(self, targets=None):
