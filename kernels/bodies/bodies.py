@@ -8,6 +8,7 @@ import warp as wp
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.poses import HALF, PairBatch
 from warp_abtree.kernels.intersect.face_pairs import Hits, is_whole
+from warp_abtree.kernels.motion.turn import shortest_turn
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -18,15 +19,15 @@ DYNAMIC = wp.constant(2)
 
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 
+TURN_PARTS, PARTS_MAX, TURN_MAX = (wp.constant(wp.float64(x)) for x in (2.0, 32.0, 2.0**20))
+"""Parts that a turn is integrated in, one each half a radian, and at most; largest tangent of a turn."""
+
+ITERATIONS_MAX, CONVERGED, TWELVE = wp.constant(8), wp.constant(wp.float64(2.0**-80)), wp.constant(wp.float64(12.0))
+"""Steps of Newton's method at most, and square of the last one."""
+
 FREE, STUCK, ON_TRIAL, STUCK_AGAIN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
 """Whether a body's last motion was cut to next to nothing, and what came of it; the odd ones move out of contact."""
 
-ITERATIONS_MAX, CONVERGED = wp.constant(8), wp.constant(wp.float64(2.0**-80))
-TURN_PARTS, PARTS_MAX, TWELVE = (
-    wp.constant(wp.float64(2.0)),
-    wp.constant(wp.float64(32.0)),
-    wp.constant(wp.float64(12.0)),
-)
 LOOKAHEAD_LEAST, LOOKAHEAD_MAX = wp.constant(wp.float64(2.0**-8)), wp.constant(wp.float64(0.25))
 """How far ahead of a body contacts are looked for, beside its motion in a step, and motion at most, in its radii."""
 
@@ -67,48 +68,43 @@ def rotation_by(v: wp.vec3d):
 
 
 @wp.func
-def turn_of(m: wp.vec3d, turn: wp.vec3d):
-    """Return the rotation vector, in the body frame, of a free body in a time that keeps its energy and momentum.
+def integrate_rotation(q: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d, dt: wp.float64):
+    """Return the rotation of a free body after a time; its angular momentum [world frame] and energy are constant.
 
-    The implicit midpoint rule for the body's momentum m, of length 1, keeps all its quadratic invariants. Where Newton's
-    method does not converge, for turns by more than a radian, a turn about m itself keeps them as well.
-
-    Args:
-        turn: By how much a momentum of 1 about each axis turns the body in the time [rad].
+    In the body frame the implicit midpoint rule keeps all quadratic invariants of the momentum m. Where Newton's method
+    fails, for turns by more than a radian, a turn about m keeps them as well.
     """
-    d = HALF * wp.vec3d(turn[2] - turn[1], turn[0] - turn[2], turn[1] - turn[0])
-    x = wp.vec3d(m)
-    iteration, left = wp.int32(0), wp.float64(1.0)
-    while iteration < ITERATIONS_MAX and left > CONVERGED:
-        u, v, w = d[0] * x, d[1] * x, d[2] * x
-        slope = wp.matrix_from_rows(
-            wp.vec3d(ONE, -u[2], -u[1]), wp.vec3d(-v[2], ONE, -v[0]), wp.vec3d(-w[1], -w[0], ONE)
-        )
-        change = wp.inverse(slope) * (m + wp.vec3d(u[1] * x[2], v[2] * x[0], w[0] * x[1]) - x)
-        x += change
-        left = wp.dot(change, change)
-        iteration += 1
-    if left <= CONVERGED:
-        return wp.cw_mul(turn, x)
-    return wp.dot(wp.cw_mul(turn, m), m) * m
+    size = wp.length(momentum)
+    if size == ZERO or size == wp.float64(wp.inf):
+        return q
+    whole, direction = dt * size * inverse_moment, momentum / size
+    angle = wp.length(wp.cw_mul(whole, wp.quat_rotate_inv(q, direction)))
+    parts = wp.int32(wp.clamp(TURN_PARTS * angle, ONE, PARTS_MAX))
+    part = wp.min(angle / wp.float64(parts), ONE)
+    turn = ((ONE + part * part / TWELVE) / wp.float64(parts)) * whole  # a tangent, see `rotation_by`
+    change = HALF * wp.vec3d(turn[2] - turn[1], turn[0] - turn[2], turn[1] - turn[0])
+    for _ in range(parts):
+        m = wp.quat_rotate_inv(q, direction)
+        x, iteration, left = wp.vec3d(m), wp.int32(0), wp.float64(1.0)
+        while iteration < ITERATIONS_MAX and left > CONVERGED:
+            u, v, w = change[0] * x, change[1] * x, change[2] * x
+            slope = wp.mat33d(ONE, -u[2], -u[1], -v[2], ONE, -v[0], -w[1], -w[0], ONE)
+            step = wp.inverse(slope) * (m + wp.vec3d(u[1] * x[2], v[2] * x[0], w[0] * x[1]) - x)
+            x += step
+            left = wp.dot(step, step)
+            iteration += 1
+        about = wp.cw_mul(turn, x)
+        if not left <= CONVERGED:
+            about = wp.min(wp.dot(wp.cw_mul(turn, m), m), TURN_MAX) * m
+        q = q * rotation_by(about)
+    return wp.normalize(q)
 
 
 @wp.func
-def integrate_rotation(q: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d, dt: wp.float64):
-    """Return the rotation of a free body after a time; its angular momentum [world frame] and energy are constant."""
-    size = wp.length(momentum)
-    if size == ZERO:
-        return q
-    turn = dt * size * inverse_moment
-    m = wp.quat_rotate_inv(q, momentum / size)
-    angle = wp.length(wp.cw_mul(turn, m))
-    parts = wp.int32(wp.clamp(TURN_PARTS * angle, ONE, PARTS_MAX))
-    for _ in range(parts):
-        # Of which half the angle's tangent is about what it is to be.
-        part = wp.min(angle / wp.float64(parts), ONE)
-        m = wp.quat_rotate_inv(q, momentum / size)
-        q = q * rotation_by(turn_of(m, ((ONE + part * part / TWELVE) / wp.float64(parts)) * turn))
-    return wp.normalize(q)
+def world_inertia(q: wp.quatd, inverse_moment: wp.vec3d):
+    """Return the inverse inertia of a body in the world frame."""
+    r = wp.quat_to_matrix(q)
+    return r * wp.diag(inverse_moment) * wp.transpose(r)
 
 
 @wp.kernel
@@ -130,15 +126,13 @@ def begin_step_kernel(dt: wp.float64, targets: ObjectPool, objects: ObjectPool, 
     bodies_inout.bid[i] = wp.int64(0)
     bodies_inout.colors[i] = 0
     if bodies_inout.motion_type[i] == DYNAMIC:
-        r = wp.quat_to_matrix(bodies_inout.rotation[i])
-        bodies_inout.inverse_inertia[i] = r * wp.diag(bodies_inout.inverse_moment[i]) * wp.transpose(r)
+        bodies_inout.inverse_inertia[i] = world_inertia(bodies_inout.rotation[i], bodies_inout.inverse_moment[i])
         return
     bodies_inout.position[i] = objects.position[i]
     if bodies_inout.motion_type[i] == KINEMATIC:
-        turn = wp.quat_from_matrix(targets.rotation[i] * wp.transpose(objects.rotation[i]))
-        axis, angle = wp.quat_to_axis_angle(turn)
+        axis, angle, _half = shortest_turn(targets.rotation[i] * wp.transpose(objects.rotation[i]))
         bodies_inout.velocity[i] = (targets.position[i] - objects.position[i]) / dt
-        bodies_inout.momentum[i] = (angle / dt) * axis
+        bodies_inout.momentum[i] = (wp.max(angle, ZERO) / dt) * axis
         bodies_inout.inverse_inertia[i] = wp.identity(n=3, dtype=wp.float64)
 
 
@@ -166,11 +160,10 @@ def move_bodies_kernel(h: wp.float64, bodies_inout: Bodies):
     bodies_inout.moved[i] += h * bodies_inout.velocity[i]
     bodies_inout.turned[i] += h * (bodies_inout.inverse_inertia[i] * momentum)
     if bodies_inout.motion_type[i] == DYNAMIC:
-        q = bodies_inout.rotation[i]
+        inverse = bodies_inout.inverse_moment[i]
         bodies_inout.position[i] += h * bodies_inout.velocity[i]
-        bodies_inout.rotation[i] = integrate_rotation(q, momentum, bodies_inout.inverse_moment[i], h)
-        r = wp.quat_to_matrix(bodies_inout.rotation[i])
-        bodies_inout.inverse_inertia[i] = r * wp.diag(bodies_inout.inverse_moment[i]) * wp.transpose(r)
+        bodies_inout.rotation[i] = integrate_rotation(bodies_inout.rotation[i], momentum, inverse, h)
+        bodies_inout.inverse_inertia[i] = world_inertia(bodies_inout.rotation[i], inverse)
 
 
 @wp.func
