@@ -56,6 +56,9 @@ class Bodies:
     turned: wp.array(dtype=wp.vec3d)  # rotation so far, sum of axis times angle [rad]
     impulse: wp.array(dtype=wp.vec3d)  # sum of the impulses that the next substep begins with
     moment: wp.array(dtype=wp.vec3d)  # sum of their moments about the centre of mass
+    solved: wp.array(dtype=wp.vec3d)  # velocity that also takes it out of contact
+    solved_momentum: wp.array(dtype=wp.vec3d)  # its angular momentum
+    corrects: wp.array(dtype=wp.int32)
     bid: wp.array(dtype=wp.int64)  # highest bid of the graph coloring
     colors: wp.array(dtype=wp.int32)  # bit mask of the colors that its pairs have
     is_whole: wp.array(dtype=wp.int32)  # entry 0: whether all contacts are known, 0 or 1; else bodies keep their state
@@ -124,6 +127,7 @@ def begin_step_kernel(dt: wp.float64, targets: ObjectPool, objects: ObjectPool, 
     bodies_inout.impulse[i] = wp.vec3d()
     bodies_inout.moment[i] = wp.vec3d()
     bodies_inout.bid[i] = wp.int64(0)
+    bodies_inout.corrects[i] = 0
     bodies_inout.colors[i] = 0
     if bodies_inout.motion_type[i] == DYNAMIC:
         bodies_inout.inverse_inertia[i] = world_inertia(bodies_inout.rotation[i], bodies_inout.inverse_moment[i])
@@ -149,21 +153,45 @@ def begin_substep_kernel(velocity_change: wp.vec3d, bodies_inout: Bodies):
 
 
 @wp.kernel
+def keep_solved_kernel(bodies_inout: Bodies):
+    """Keep the velocities of a body, solved and not relaxed yet."""
+    i = wp.tid()
+    bodies_inout.solved[i] = bodies_inout.velocity[i]
+    bodies_inout.solved_momentum[i] = bodies_inout.momentum[i]
+
+
+@wp.func
+def without_gain(before: wp.quatd, after: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d):
+    """Return by what to scale a body's angular momentum after a turn that is not its own, to add no energy."""
+    m, n = wp.quat_rotate_inv(before, momentum), wp.quat_rotate_inv(after, momentum)
+    had, has = wp.dot(m, wp.cw_mul(inverse_moment, m)), wp.dot(n, wp.cw_mul(inverse_moment, n))
+    return wp.where(has > had, wp.sqrt(had / has), ONE)
+
+
+@wp.kernel
 def move_bodies_kernel(h: wp.float64, bodies_inout: Bodies):
-    """Move an object by its velocity for the time of a substep, unless it is a stuck body."""
+    """Move an object for a substep: by its velocity, unless it is a stuck body, and out of contact, without energy."""
     i = wp.tid()
     if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] == STATIC:
         return
-    if bodies_inout.motion_type[i] == DYNAMIC and (bodies_inout.stuck[i] & 1) != 0:
-        return
-    momentum = bodies_inout.momentum[i]
-    bodies_inout.moved[i] += h * bodies_inout.velocity[i]
-    bodies_inout.turned[i] += h * (bodies_inout.inverse_inertia[i] * momentum)
-    if bodies_inout.motion_type[i] == DYNAMIC:
-        inverse = bodies_inout.inverse_moment[i]
-        bodies_inout.position[i] += h * bodies_inout.velocity[i]
-        bodies_inout.rotation[i] = integrate_rotation(bodies_inout.rotation[i], momentum, inverse, h)
-        bodies_inout.inverse_inertia[i] = world_inertia(bodies_inout.rotation[i], inverse)
+    is_body = bodies_inout.motion_type[i] == DYNAMIC
+    own = wp.where(is_body and (bodies_inout.stuck[i] & 1) != 0, ZERO, h)
+    velocity, momentum, inertia = bodies_inout.velocity[i], bodies_inout.momentum[i], bodies_inout.inverse_inertia[i]
+    step, turn = own * velocity, own * (inertia * momentum)
+    if is_body:
+        q, inverse = bodies_inout.rotation[i], bodies_inout.inverse_moment[i]
+        after = integrate_rotation(q, momentum, inverse, own)
+        if bodies_inout.corrects[i] != 0:
+            more = h * (inertia * (bodies_inout.solved_momentum[i] - momentum))
+            step += h * (bodies_inout.solved[i] - velocity)
+            turn += more
+            after = wp.normalize(rotation_by(more) * after)
+            bodies_inout.momentum[i] = without_gain(q, after, momentum, inverse) * momentum
+        bodies_inout.position[i] += step
+        bodies_inout.rotation[i] = after
+        bodies_inout.inverse_inertia[i] = world_inertia(after, inverse)
+    bodies_inout.moved[i] += step
+    bodies_inout.turned[i] += turn
 
 
 @wp.func

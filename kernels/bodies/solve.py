@@ -134,6 +134,9 @@ def relax_pair(
     apply_impulses(units, p, pair, point, manifolds, constraints, bodies, relaxed)
     if resolve_lane() == 0:
         constraints.is_struck[p] = struck
+        if corrects:
+            for k in range(2):
+                bodies.corrects[pair[k]] = 1
     warp_sync()
 
 

@@ -204,12 +204,9 @@ class Dynamics(RigidBodies):
             for _ in range(substeps):
                 self._launch(body_kernels.begin_substep_kernel, n, [wp.vec3d(*(h * self.gravity)), bodies])
                 self._relax(each, solve.SOLVE)
-                self._launch(body_kernels.move_bodies_kernel, n, [h, bodies])
-                if self.certified is not None:
-                    self.certified.keep_solved()
+                self._launch(body_kernels.keep_solved_kernel, n, [bodies])
                 self._relax(each, solve.RELAX)
-                if self.certified is not None:
-                    self.certified.free_stuck(h)
+                self._launch(body_kernels.move_bodies_kernel, n, [h, bodies])
             inputs = [query.broad_phase.key, *posed, self.constraints, bodies, self._warm_start]
             self._launch(constraint_kernels.save_impulses_kernel, room, inputs)
             posed = self._pool if self.certified is None else self.certified.goals
