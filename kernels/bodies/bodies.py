@@ -141,18 +141,6 @@ def begin_step_kernel(dt: wp.float64, targets: ObjectPool, objects: ObjectPool, 
 
 
 @wp.kernel
-def begin_substep_kernel(velocity_change: wp.vec3d, bodies_inout: Bodies):
-    """Change the velocities of a body by gravity, and by the impulses that the substep begins with."""
-    i = wp.tid()
-    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] != DYNAMIC:
-        return
-    bodies_inout.velocity[i] += velocity_change + bodies_inout.inverse_mass[i] * bodies_inout.impulse[i]
-    bodies_inout.momentum[i] += bodies_inout.moment[i]
-    bodies_inout.impulse[i] = wp.vec3d()
-    bodies_inout.moment[i] = wp.vec3d()
-
-
-@wp.kernel
 def keep_solved_kernel(bodies_inout: Bodies):
     """Keep the velocities of a body, solved and not relaxed yet."""
     i = wp.tid()
@@ -168,12 +156,9 @@ def without_gain(before: wp.quatd, after: wp.quatd, momentum: wp.vec3d, inverse_
     return wp.where(has > had, wp.sqrt(had / has), ONE)
 
 
-@wp.kernel
-def move_bodies_kernel(h: wp.float64, bodies_inout: Bodies):
+@wp.func
+def move_object(i: wp.int32, h: wp.float64, bodies_inout: Bodies):
     """Move an object for a substep: by its velocity, unless it is a stuck body, and out of contact, without energy."""
-    i = wp.tid()
-    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] == STATIC:
-        return
     is_body = bodies_inout.motion_type[i] == DYNAMIC
     own = wp.where(is_body and (bodies_inout.stuck[i] & 1) != 0, ZERO, h)
     velocity, momentum, inertia = bodies_inout.velocity[i], bodies_inout.momentum[i], bodies_inout.inverse_inertia[i]
@@ -192,6 +177,26 @@ def move_bodies_kernel(h: wp.float64, bodies_inout: Bodies):
         bodies_inout.inverse_inertia[i] = world_inertia(after, inverse)
     bodies_inout.moved[i] += step
     bodies_inout.turned[i] += turn
+
+
+@wp.kernel
+def move_bodies_kernel(h: wp.float64, begins: wp.int32, velocity_change: wp.vec3d, bodies_inout: Bodies):
+    """End a substep and begin the next: move objects, then change velocities by gravity and by the impulses summed up.
+
+    Args:
+        h: Length of the substep that ends, 0 where a step begins.
+        begins: 1, or 0 where the step ends.
+    """
+    i = wp.tid()
+    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] == STATIC:
+        return
+    if h > ZERO:
+        move_object(i, h, bodies_inout)
+    if begins != 0 and bodies_inout.motion_type[i] == DYNAMIC:
+        bodies_inout.velocity[i] += velocity_change + bodies_inout.inverse_mass[i] * bodies_inout.impulse[i]
+        bodies_inout.momentum[i] += bodies_inout.moment[i]
+        bodies_inout.impulse[i] = wp.vec3d()
+        bodies_inout.moment[i] = wp.vec3d()
 
 
 @wp.func

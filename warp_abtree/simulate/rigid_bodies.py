@@ -201,12 +201,13 @@ class Dynamics(RigidBodies):
             self._launch(constraint_kernels.prepare_constraints_kernel, room, inputs)
             self._color_pairs()
             self._relax(each, solve.WARM_START)
-            for _ in range(substeps):
-                self._launch(body_kernels.begin_substep_kernel, n, [wp.vec3d(*(h * self.gravity)), bodies])
-                self._relax(each, solve.SOLVE)
-                self._launch(body_kernels.keep_solved_kernel, n, [bodies])
-                self._relax(each, solve.RELAX)
-                self._launch(body_kernels.move_bodies_kernel, n, [h, bodies])
+            for turn in range(substeps + 1):
+                inputs = [h if turn else 0.0, int(turn < substeps), wp.vec3d(*(h * self.gravity)), bodies]
+                self._launch(body_kernels.move_bodies_kernel, n, inputs)
+                if turn < substeps:
+                    self._relax(each, solve.SOLVE)
+                    self._launch(body_kernels.keep_solved_kernel, n, [bodies])
+                    self._relax(each, solve.RELAX)
             inputs = [query.broad_phase.key, *posed, self.constraints, bodies, self._warm_start]
             self._launch(constraint_kernels.save_impulses_kernel, room, inputs)
             posed = self._pool if self.certified is None else self.certified.goals
