@@ -19,10 +19,10 @@ DYNAMIC = wp.constant(2)
 
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 
-TURN_PARTS, PARTS_MAX, TURN_MAX = (wp.constant(wp.float64(x)) for x in (2.0, 32.0, 2.0**20))
-"""Parts that a turn is integrated in, one each half a radian, and at most; largest tangent of a turn."""
+PART, PARTS_MAX, TURN_MAX = (wp.constant(wp.float64(x)) for x in (0.5, 32.0, 2.0**20))
+"""A turn is integrated in parts of so many radians at most, while these are no more; largest tangent of a part."""
 
-ITERATIONS_MAX, CONVERGED, TWELVE = wp.constant(8), wp.constant(wp.float64(2.0**-80)), wp.constant(wp.float64(12.0))
+ITERATIONS_MAX, CONVERGED = wp.constant(8), wp.constant(wp.float64(2.0**-80))
 """Steps of Newton's method at most, and square of the last one."""
 
 FREE, STUCK, ON_TRIAL, STUCK_AGAIN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
@@ -58,7 +58,7 @@ class Bodies:
     moment: wp.array(dtype=wp.vec3d)  # sum of their moments about the centre of mass
     solved: wp.array(dtype=wp.vec3d)  # velocity that also takes it out of contact
     solved_momentum: wp.array(dtype=wp.vec3d)  # its angular momentum
-    corrects: wp.array(dtype=wp.int32)
+    corrects: wp.array(dtype=wp.int32)  # whether a pair of it takes deep points apart, 0 or 1
     bid: wp.array(dtype=wp.int64)  # highest bid of the graph coloring
     colors: wp.array(dtype=wp.int32)  # bit mask of the colors that its pairs have
     is_whole: wp.array(dtype=wp.int32)  # entry 0: whether all contacts are known, 0 or 1; else bodies keep their state
@@ -82,9 +82,9 @@ def integrate_rotation(q: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d
         return q
     whole, direction = dt * size * inverse_moment, momentum / size
     angle = wp.length(wp.cw_mul(whole, wp.quat_rotate_inv(q, direction)))
-    parts = wp.int32(wp.clamp(TURN_PARTS * angle, ONE, PARTS_MAX))
+    parts = wp.int32(wp.clamp(ONE + angle / PART, ONE, PARTS_MAX))
     part = wp.min(angle / wp.float64(parts), ONE)
-    turn = ((ONE + part * part / TWELVE) / wp.float64(parts)) * whole  # a tangent, see `rotation_by`
+    turn = ((ONE + part * part / wp.float64(12.0)) / wp.float64(parts)) * whole  # a tangent, see `rotation_by`
     change = HALF * wp.vec3d(turn[2] - turn[1], turn[0] - turn[2], turn[1] - turn[0])
     for _ in range(parts):
         m = wp.quat_rotate_inv(q, direction)
