@@ -1,9 +1,9 @@
 """Rigid bodies that respond to the contacts of their meshes: `Dynamics`.
 
 One step: contacts where the bodies stand, and where they first meet as far ahead as they move; substeps of gravity,
-contact impulses by projected Gauss-Seidel with warm starting and Coulomb friction, soft where points penetrate, motion
-by semi-implicit Euler with a symplectic rotation, and relaxation; with `continuous`, motions cut where surfaces would
-meet. All in float64; docs/dynamics.md has each part, what is conserved and repeated, figures, and limits.
+contact impulses by projected Gauss-Seidel with warm starting and Coulomb friction, soft where points penetrate,
+relaxation, and motion by semi-implicit Euler with rotations that keep energy; with `continuous`, motions cut where
+surfaces would meet. docs/dynamics.md has each part, what is conserved and repeated, figures, and limits.
 """
 
 from contextlib import contextmanager
@@ -138,7 +138,7 @@ class Dynamics(RigidBodies):
                 objects count, which rotate by less than half a turn. None leaves them where they are.
 
         Raises:
-            ValueError: A step that is not above 0, or bad poses; nothing is changed.
+            ValueError: A step that is not above 0 or too long for a thin body, or bad poses; nothing is changed.
             RuntimeError: Objects were added to the scene, or a step was interrupted.
             CapacityError: More contacts than can be numbered.
         """
@@ -229,7 +229,7 @@ class Dynamics(RigidBodies):
         Where contacts or pairs outrun the capacity nothing moves; `check` raises then.
 
         Raises:
-            ValueError: A step that is not above 0.
+            ValueError: A step that is not above 0, or too long for a thin body.
             RuntimeError: As `step`.
         """
         dt = positive(dt, "dt")
