@@ -1,7 +1,8 @@
 """Relaxation of contact constraints: projected Gauss-Seidel (sequential impulses), one color of pairs after another.
 
 A step has substeps, each of which begins with the impulses of the one before, solves for velocities that also take
-penetrating points apart, moves the bodies, and relaxes: removes what took points apart from the velocities again.
+penetrating points apart, relaxes: removes that from the velocities again, and moves the bodies by both. What moves and
+relaxes at one place adds no energy.
 Points that penetrate are springs, stiff for the length of a substep, so that a stack finds its balance.
 Source: Macklin et al. 2019, Small Steps in Physics Simulation; Catto 2024, Solver2D ("soft step").
 
