@@ -8,6 +8,7 @@ import warp as wp
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.poses import HALF, PairBatch
 from warp_abtree.kernels.intersect.face_pairs import Hits, is_whole
+from warp_abtree.kernels.motion.turn import shortest_turn
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -17,6 +18,12 @@ DYNAMIC = wp.constant(2)
 """Motion type of an object: it stands, its motion is prescribed, or it is a rigid body."""
 
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
+
+PART, PARTS_MAX, TURN_MAX = (wp.constant(wp.float64(x)) for x in (0.5, 32.0, 2.0**20))
+"""A turn is integrated in parts of so many radians at most, while these are no more; largest tangent of a part."""
+
+ITERATIONS_MAX, CONVERGED = wp.constant(8), wp.constant(wp.float64(2.0**-80))
+"""Steps of Newton's method at most, and square of the last one."""
 
 FREE, STUCK, ON_TRIAL, STUCK_AGAIN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
 """Whether a body's last motion was cut to next to nothing, and what came of it; the odd ones move out of contact."""
@@ -36,6 +43,7 @@ class Bodies:
     centre: wp.array(dtype=wp.vec3d)  # centre of mass, model frame [world units]
     axes: wp.array(dtype=wp.mat33d)  # principal axes as columns, model frame
     bounding_radius: wp.array(dtype=wp.float64)  # about the centre of mass [world units]
+    slop: wp.array(dtype=wp.float64)  # penetration that matters little [world units]
     position: wp.array(dtype=wp.vec3d)  # of the body frame [world units]
     rotation: wp.array(dtype=wp.quatd)  # of the body frame, x y z w
     velocity: wp.array(dtype=wp.vec3d)  # of the centre of mass [world units/s]
@@ -48,6 +56,9 @@ class Bodies:
     turned: wp.array(dtype=wp.vec3d)  # rotation so far, sum of axis times angle [rad]
     impulse: wp.array(dtype=wp.vec3d)  # sum of the impulses that the next substep begins with
     moment: wp.array(dtype=wp.vec3d)  # sum of their moments about the centre of mass
+    solved: wp.array(dtype=wp.vec3d)  # velocity that also takes it out of contact
+    solved_momentum: wp.array(dtype=wp.vec3d)  # its angular momentum
+    corrects: wp.array(dtype=wp.int32)  # whether a pair of it takes deep points apart, 0 or 1
     bid: wp.array(dtype=wp.int64)  # highest bid of the graph coloring
     colors: wp.array(dtype=wp.int32)  # bit mask of the colors that its pairs have
     is_whole: wp.array(dtype=wp.int32)  # entry 0: whether all contacts are known, 0 or 1; else bodies keep their state
@@ -55,28 +66,48 @@ class Bodies:
 
 @wp.func
 def rotation_by(v: wp.vec3d):
-    """Return the quaternion of a rotation vector, axis times angle [rad]."""
-    return wp.quat_from_axis_angle(wp.normalize(v), wp.length(v))
+    """Return the quaternion of a rotation vector, axis times twice the tangent of half the angle."""
+    return wp.normalize(wp.quatd(HALF * v[0], HALF * v[1], HALF * v[2], ONE))
 
 
 @wp.func
 def integrate_rotation(q: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d, dt: wp.float64):
-    """Return the rotation of a free body after a time; its angular momentum [world frame] is constant.
+    """Return the rotation of a free body after a time; its angular momentum [world frame] and energy are constant.
 
-    The kinetic energy is split into that of the three axes, each of which gives a plain rotation. Their symmetric
-    product is symplectic: the energy oscillates and does not drift.
-    Source: McLachlan 1993, Explicit Lie-Poisson integration and the Euler equations; Reich 1994.
+    In the body frame the implicit midpoint rule keeps all quadratic invariants of the momentum m. Where Newton's method
+    fails, for turns by more than a radian, a turn about m keeps them as well.
     """
-    m = wp.quat_rotate_inv(q, momentum)
-    for k in range(5):
-        axis = wp.where(k < 3, k, 4 - k)
-        part = wp.where(k == 2, dt, HALF * dt)
-        v = wp.vec3d()
-        v[axis] = part * m[axis] * inverse_moment[axis]
-        turn = rotation_by(v)
-        q = q * turn
-        m = wp.quat_rotate_inv(turn, m)
+    size = wp.length(momentum)
+    if size == ZERO or size == wp.float64(wp.inf):
+        return q
+    whole, direction = dt * size * inverse_moment, momentum / size
+    angle = wp.length(wp.cw_mul(whole, wp.quat_rotate_inv(q, direction)))
+    parts = wp.int32(wp.clamp(ONE + angle / PART, ONE, PARTS_MAX))
+    part = wp.min(angle / wp.float64(parts), ONE)
+    turn = ((ONE + part * part / wp.float64(12.0)) / wp.float64(parts)) * whole  # a tangent, see `rotation_by`
+    change = HALF * wp.vec3d(turn[2] - turn[1], turn[0] - turn[2], turn[1] - turn[0])
+    for _ in range(parts):
+        m = wp.quat_rotate_inv(q, direction)
+        x, iteration, left = wp.vec3d(m), wp.int32(0), wp.float64(1.0)
+        while iteration < ITERATIONS_MAX and left > CONVERGED:
+            u, v, w = change[0] * x, change[1] * x, change[2] * x
+            slope = wp.mat33d(ONE, -u[2], -u[1], -v[2], ONE, -v[0], -w[1], -w[0], ONE)
+            step = wp.inverse(slope) * (m + wp.vec3d(u[1] * x[2], v[2] * x[0], w[0] * x[1]) - x)
+            x += step
+            left = wp.dot(step, step)
+            iteration += 1
+        about = wp.cw_mul(turn, x)
+        if not left <= CONVERGED:
+            about = wp.min(wp.dot(wp.cw_mul(turn, m), m), TURN_MAX) * m
+        q = q * rotation_by(about)
     return wp.normalize(q)
+
+
+@wp.func
+def world_inertia(q: wp.quatd, inverse_moment: wp.vec3d):
+    """Return the inverse inertia of a body in the world frame."""
+    r = wp.quat_to_matrix(q)
+    return r * wp.diag(inverse_moment) * wp.transpose(r)
 
 
 @wp.kernel
@@ -96,47 +127,87 @@ def begin_step_kernel(dt: wp.float64, targets: ObjectPool, objects: ObjectPool, 
     bodies_inout.impulse[i] = wp.vec3d()
     bodies_inout.moment[i] = wp.vec3d()
     bodies_inout.bid[i] = wp.int64(0)
+    bodies_inout.corrects[i] = 0
     bodies_inout.colors[i] = 0
     if bodies_inout.motion_type[i] == DYNAMIC:
-        r = wp.quat_to_matrix(bodies_inout.rotation[i])
-        bodies_inout.inverse_inertia[i] = r * wp.diag(bodies_inout.inverse_moment[i]) * wp.transpose(r)
+        bodies_inout.inverse_inertia[i] = world_inertia(bodies_inout.rotation[i], bodies_inout.inverse_moment[i])
         return
     bodies_inout.position[i] = objects.position[i]
     if bodies_inout.motion_type[i] == KINEMATIC:
-        turn = wp.quat_from_matrix(targets.rotation[i] * wp.transpose(objects.rotation[i]))
-        axis, angle = wp.quat_to_axis_angle(turn)
+        axis, angle, _half = shortest_turn(targets.rotation[i] * wp.transpose(objects.rotation[i]))
         bodies_inout.velocity[i] = (targets.position[i] - objects.position[i]) / dt
-        bodies_inout.momentum[i] = (angle / dt) * axis
+        bodies_inout.momentum[i] = (wp.max(angle, ZERO) / dt) * axis
         bodies_inout.inverse_inertia[i] = wp.identity(n=3, dtype=wp.float64)
 
 
 @wp.kernel
-def begin_substep_kernel(velocity_change: wp.vec3d, bodies_inout: Bodies):
-    """Change the velocities of a body by gravity, and by the impulses that the substep begins with."""
+def keep_solved_kernel(bodies_inout: Bodies):
+    """Keep the velocities of a body, solved and not relaxed yet."""
     i = wp.tid()
-    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] != DYNAMIC:
-        return
-    bodies_inout.velocity[i] += velocity_change + bodies_inout.inverse_mass[i] * bodies_inout.impulse[i]
-    bodies_inout.momentum[i] += bodies_inout.moment[i]
-    bodies_inout.impulse[i] = wp.vec3d()
-    bodies_inout.moment[i] = wp.vec3d()
+    bodies_inout.solved[i] = bodies_inout.velocity[i]
+    bodies_inout.solved_momentum[i] = bodies_inout.momentum[i]
+
+
+@wp.func
+def without_gain(before: wp.quatd, after: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d):
+    """Return by what to scale a body's angular momentum after a turn that is not its own, to add no energy."""
+    m, n = wp.quat_rotate_inv(before, momentum), wp.quat_rotate_inv(after, momentum)
+    had, has = wp.dot(m, wp.cw_mul(inverse_moment, m)), wp.dot(n, wp.cw_mul(inverse_moment, n))
+    return wp.where(has > had, wp.sqrt(had / has), ONE)
+
+
+@wp.func
+def move_object(i: wp.int32, h: wp.float64, bodies_inout: Bodies):
+    """Move an object for a substep: by its velocity, unless it is a stuck body, and out of contact, without energy."""
+    is_body = bodies_inout.motion_type[i] == DYNAMIC
+    own = wp.where(is_body and (bodies_inout.stuck[i] & 1) != 0, ZERO, h)
+    velocity, momentum, inertia = bodies_inout.velocity[i], bodies_inout.momentum[i], bodies_inout.inverse_inertia[i]
+    step, turn = own * velocity, own * (inertia * momentum)
+    if is_body:
+        q, inverse = bodies_inout.rotation[i], bodies_inout.inverse_moment[i]
+        after = integrate_rotation(q, momentum, inverse, own)
+        if bodies_inout.corrects[i] != 0:
+            more = h * (inertia * (bodies_inout.solved_momentum[i] - momentum))
+            step += h * (bodies_inout.solved[i] - velocity)
+            turn += more
+            after = wp.normalize(rotation_by(more) * after)
+            bodies_inout.momentum[i] = without_gain(q, after, momentum, inverse) * momentum
+        bodies_inout.position[i] += step
+        bodies_inout.rotation[i] = after
+        bodies_inout.inverse_inertia[i] = world_inertia(after, inverse)
+    bodies_inout.moved[i] += step
+    bodies_inout.turned[i] += turn
 
 
 @wp.kernel
-def move_bodies_kernel(h: wp.float64, bodies_inout: Bodies):
-    """Move an object by its velocity for the time of a substep, unless it is a stuck body."""
+def move_bodies_kernel(h: wp.float64, begins: wp.int32, velocity_change: wp.vec3d, bodies_inout: Bodies):
+    """End a substep and begin the next: move objects, then change velocities by gravity and by the impulses summed up.
+
+    Args:
+        h: Length of the substep that ends, 0 where a step begins.
+        begins: 1, or 0 where the step ends.
+    """
     i = wp.tid()
     if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] == STATIC:
         return
-    if bodies_inout.motion_type[i] == DYNAMIC and (bodies_inout.stuck[i] & 1) != 0:
-        return
-    momentum = bodies_inout.momentum[i]
-    bodies_inout.moved[i] += h * bodies_inout.velocity[i]
-    bodies_inout.turned[i] += h * (bodies_inout.inverse_inertia[i] * momentum)
-    if bodies_inout.motion_type[i] == DYNAMIC:
-        q = bodies_inout.rotation[i]
-        bodies_inout.position[i] += h * bodies_inout.velocity[i]
-        bodies_inout.rotation[i] = integrate_rotation(q, momentum, bodies_inout.inverse_moment[i], h)
+    if h > ZERO:
+        move_object(i, h, bodies_inout)
+    if begins != 0 and bodies_inout.motion_type[i] == DYNAMIC:
+        bodies_inout.velocity[i] += velocity_change + bodies_inout.inverse_mass[i] * bodies_inout.impulse[i]
+        bodies_inout.momentum[i] += bodies_inout.moment[i]
+        bodies_inout.impulse[i] = wp.vec3d()
+        bodies_inout.moment[i] = wp.vec3d()
+
+
+@wp.func
+def slop_of(bodies: Bodies, pair: wp.vec2i):
+    return wp.min(bodies.slop[pair[0]], bodies.slop[pair[1]])
+
+
+@wp.func
+def radius_of(bodies: Bodies, pair: wp.vec2i):
+    """Return the smaller bounding radius of two bodies [world units]."""
+    return wp.min(bodies.bounding_radius[pair[0]], bodies.bounding_radius[pair[1]])
 
 
 @wp.func

@@ -4,14 +4,11 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import ObjectPool, pair_key
 from warp_abtree.kernels.base.poses import PairBatch
-from warp_abtree.kernels.bodies.bodies import DYNAMIC, Bodies
+from warp_abtree.kernels.bodies.bodies import DYNAMIC, Bodies, radius_of
 from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT, INACTIVE
 from warp_abtree.kernels.contacts.manifold import Manifolds
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
-
-SLOP = wp.constant(wp.float64(2.0**-9))
-"""Penetration that matters little, as a fraction of the bounding radius."""
 
 MATCH_RADIUS = wp.constant(wp.float64(0.05))
 """Largest distance of a point from its match in the step before, as a fraction of the bounding radius."""
@@ -25,7 +22,6 @@ class Constraints:
     arm_b: wp.array2d(dtype=wp.vec3d)  # from that of the second
     impulse: wp.array2d(dtype=wp.float64)  # of a substep, along the normal
     friction_impulse: wp.array2d(dtype=wp.vec3d)  # of a substep, across the normal, world frame
-    slop: wp.array(dtype=wp.float64)  # [pair] penetration that matters little [world units]
     is_struck: wp.array(dtype=wp.int32)  # [pair] whether it met fast: the next substep has none of its impulses
     color: wp.array(dtype=wp.int32)  # [pair] 0 .. COLOR_COUNT, or INACTIVE
 
@@ -82,8 +78,6 @@ def prepare_constraints_kernel(
     if bodies.motion_type[a] != DYNAMIC and bodies.motion_type[b] != DYNAMIC:
         return
     constraints_out.color[p] = COLOR_COUNT
-    radius = wp.min(bodies.bounding_radius[a], bodies.bounding_radius[b])
-    constraints_out.slop[p] = SLOP * radius
     constraints_out.is_struck[p] = 0
     key = pair_key(batch.pairs[p])
     row = wp.min(wp.lower_bound(warm_start.key, key), warm_start.key.shape[0] - 1)
@@ -106,7 +100,7 @@ def prepare_constraints_kernel(
         speed = wp.dot(normal, velocity_at(bodies, b, arm_b) - velocity_at(bodies, a, arm_a))
         if known and wp.abs(speed) <= fast:
             local = wp.transpose(objects.rotation[a]) * (x - objects.position[a])
-            match = find_match(warm_start, row, MATCH_RADIUS * radius, local, used)
+            match = find_match(warm_start, row, MATCH_RADIUS * radius_of(bodies, batch.pairs[p]), local, used)
             if match < 0 and before > wp.float64(0.0):
                 constraints_out.impulse[p, k] = before / wp.float64(warm_start.count[row])
             if match >= 0:

@@ -23,9 +23,9 @@ from warp_abtree.kernels.bodies.bodies import (
     STUCK_AGAIN,
     ZERO,
     Bodies,
-    rotation_by,
+    slop_of,
+    without_gain,
 )
-from warp_abtree.kernels.bodies.constraints import SLOP
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, UNDECIDED
 from warp_abtree.kernels.motion.path import Motion, make_path
@@ -41,6 +41,9 @@ CUT, MATCH, HOLD_BOTH, CERTIFY = wp.constant(0), wp.constant(1), wp.constant(2),
 """What a round does with pairs that are not clear: cut ways at the time of contact, cut the larger fraction to the
 smaller, cut both at the start, or hold the world."""
 
+TIME_TOLERANCE = wp.constant(wp.float64(2.0**-24))
+"""Of times of first contacts, as a fraction of a way."""
+
 NEAR, VERY_NEAR = wp.constant(wp.float64(0.25)), wp.constant(wp.float64(1.0 / 32.0))
 EXEMPT, LAST_LEVEL = wp.constant(-1), wp.constant(2)
 
@@ -55,34 +58,10 @@ class StepMotions:
     fraction: wp.array(dtype=wp.float64)  # of its motion that an object makes, 0 to 1, shape [object]
     cut: wp.array(dtype=wp.float64)  # fraction of its way that the round leaves, shape [object]
     is_changed: wp.array(dtype=wp.int32)  # whether the last round has cut its way, 0 or 1, shape [object]
-    solved: wp.array(dtype=wp.vec3d)  # velocity that also takes a stuck body out of contact, shape [object]
-    solved_momentum: wp.array(dtype=wp.vec3d)  # its angular momentum
     is_held: wp.array(dtype=wp.int32)  # of each world, 0 or 1, shape [object]
     level: wp.array(dtype=wp.int32)  # of a pair's margin, 0 to LAST_LEVEL; EXEMPT where not searched, shape [pair]
     is_again: wp.array(dtype=wp.int32)  # whether a pair is searched again at another level, 0 or 1, shape [pair]
     counter: wp.array(dtype=wp.int32)  # touching and undecided pairs, and pairs that held a world, shape [3]
-
-
-@wp.kernel
-def keep_solved_kernel(bodies: Bodies, motions_inout: StepMotions):
-    """Keep the velocities of a stuck body, solved and not relaxed yet."""
-    i = wp.tid()
-    motions_inout.solved[i] = bodies.velocity[i]
-    motions_inout.solved_momentum[i] = bodies.momentum[i]
-
-
-@wp.kernel
-def free_stuck_kernel(h: wp.float64, motions: StepMotions, bodies_inout: Bodies):
-    """Move a stuck body for a substep by its position correction alone: by what relaxation took from its velocity."""
-    i = wp.tid()
-    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] != DYNAMIC or (bodies_inout.stuck[i] & 1) == 0:
-        return
-    step = h * (motions.solved[i] - bodies_inout.velocity[i])
-    turn = h * (bodies_inout.inverse_inertia[i] * (motions.solved_momentum[i] - bodies_inout.momentum[i]))
-    bodies_inout.position[i] += step
-    bodies_inout.moved[i] += step
-    bodies_inout.rotation[i] = wp.normalize(rotation_by(turn) * bodies_inout.rotation[i])
-    bodies_inout.turned[i] += turn
 
 
 @wp.kernel
@@ -134,11 +113,6 @@ def choose_pair_kernel(batch: PairBatch, motions: StepMotions, hits_inout: Hits)
     hits_inout.any_hit[p] = wp.where(changed and motions.level[p] != EXEMPT, 0, 1)
 
 
-@wp.func
-def slop_of(bodies: Bodies, pair: wp.vec2i):
-    return SLOP * wp.min(bodies.bounding_radius[pair[0]], bodies.bounding_radius[pair[1]])
-
-
 @wp.kernel
 def widen_motion_kernel(
     batch: PairBatch,
@@ -186,6 +160,14 @@ def cut_way_kernel(
     if contacts.end[p] == CLEAR:
         return
     a, b = batch.pairs[p][0], batch.pairs[p][1]
+    length = way_length(objects, motions_inout, bodies, a) + way_length(objects, motions_inout, bodies, b)
+    back = NEAR * slop_of(bodies, batch.pairs[p])
+    is_early = contacts.end[p] != UNDECIDED and contacts.time[p] <= TIME_TOLERANCE
+    if mode <= MATCH and is_early and TIME_TOLERANCE * length > back:
+        # Too long a way to tell where on it they meet: the next round searches the part that they meet on.
+        wp.atomic_min(motions_inout.cut, a, wp.float64(2.0) * TIME_TOLERANCE)
+        wp.atomic_min(motions_inout.cut, b, wp.float64(2.0) * TIME_TOLERANCE)
+        return
     if mode <= MATCH and contacts.time[p] == ZERO and motions_inout.level[p] < LAST_LEVEL:
         motions_inout.level[p] += 1
         motions_inout.is_again[p] = 1
@@ -203,8 +185,6 @@ def cut_way_kernel(
         wp.atomic_min(motions_inout.cut, b, ZERO)
         return
     # A quarter of a slop before the contact, where contacts ahead find it.
-    length = way_length(objects, motions_inout, bodies, a) + way_length(objects, motions_inout, bodies, b)
-    back = NEAR * slop_of(bodies, batch.pairs[p])
     fraction = wp.max(contacts.time[p] - back / wp.max(length, back), ZERO)
     fraction_a, fraction_b = motions_inout.fraction[a], motions_inout.fraction[b]
     less, more = wp.min(fraction_a, fraction_b), wp.max(fraction_a, fraction_b)
@@ -244,13 +224,6 @@ def apply_cut_kernel(objects: ObjectPool, bodies: Bodies, motions_inout: StepMot
     motions_inout.ends.position[i] = objects.position[i] + fraction * path.travel
 
 
-@wp.func
-def spin_energy(rotation: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d):
-    """Return twice the energy of rotation."""
-    m = wp.quat_rotate_inv(rotation, momentum)
-    return wp.dot(m, wp.cw_mul(inverse_moment, m))
-
-
 @wp.kernel
 def end_way_kernel(
     velocity_change: wp.vec3d,
@@ -275,7 +248,7 @@ def end_way_kernel(
     if not whole:
         return
     fraction = motions.fraction[i]
-    near = NEAR * SLOP * bodies_inout.bounding_radius[i]
+    near = NEAR * bodies_inout.slop[i]
     stuck = fraction < ONE and way_length(objects_inout, motions, bodies_inout, i) < near
     if motions.is_held[motions.world[i]] != 0:
         fraction = ZERO
@@ -294,11 +267,9 @@ def end_way_kernel(
     rotation = objects_inout.rotation[i]
     bodies_inout.position[i] = objects_inout.position[i] + rotation * bodies_inout.centre[i]
     q = wp.normalize(wp.quat_from_matrix(rotation * bodies_inout.axes[i]))
-    momentum, inverse = bodies_inout.momentum[i], bodies_inout.inverse_moment[i]
-    before = spin_energy(bodies_inout.rotation[i], momentum, inverse)
-    after = spin_energy(q, momentum, inverse)
+    momentum = bodies_inout.momentum[i]
+    scale = without_gain(bodies_inout.rotation[i], q, momentum, bodies_inout.inverse_moment[i])
     bodies_inout.rotation[i] = q
-    scale = wp.where(after > before, wp.sqrt(before / after), ONE)
     bodies_inout.momentum[i] = wp.where(stuck, ZERO, scale) * momentum
     down = wp.normalize(velocity_change)
     speed = wp.max(wp.dot(bodies_inout.velocity[i], down), ZERO)

@@ -8,8 +8,8 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.lanes import vector64_of_lane
 from warp_abtree.kernels.base.poses import HALF
-from warp_abtree.kernels.bodies.bodies import DYNAMIC, ONE, ZERO, Bodies
-from warp_abtree.kernels.bodies.constraints import SLOP, Constraints, velocity_at
+from warp_abtree.kernels.bodies.bodies import DYNAMIC, ONE, ZERO, Bodies, radius_of, slop_of
+from warp_abtree.kernels.bodies.constraints import Constraints, velocity_at
 from warp_abtree.kernels.contacts.manifold import Manifolds
 from warp_abtree.kernels.triangle.distance import largest_coordinate, power_below
 
@@ -22,6 +22,9 @@ RECOVERY = wp.constant(wp.float64(_FREQUENCY / _RESPONSE))
 
 SOFTNESS = wp.constant(wp.float64(1.0 / (1.0 + _FREQUENCY * _RESPONSE)))
 """Part of the impulse that it gives up."""
+
+SHORTFALL = wp.constant(2.0**-22)
+"""Part of the impulse that an impact gives up: float32 is no finer, and too much would throw bodies apart."""
 
 
 @wp.struct
@@ -100,12 +103,12 @@ def dynamic_part(bodies: Bodies, i: wp.int32):
 
 
 @wp.func
-def make_units(per_substep: wp.float64, slop: wp.float64, pair: wp.vec2i, bodies: Bodies):
+def make_units(per_substep: wp.float64, pair: wp.vec2i, bodies: Bodies):
     units = Units()
-    units.length = power_below(slop / SLOP)
+    units.length = power_below(radius_of(bodies, pair))
     units.per_length = ONE / units.length
     fastest = largest_coordinate(bodies.velocity[pair[1]] - bodies.velocity[pair[0]])
-    speed = power_below(wp.max(slop * per_substep, fastest))
+    speed = power_below(wp.max(slop_of(bodies, pair) * per_substep, fastest))
     units.per_speed = ONE / speed
     units.mass = power_below(ONE / (dynamic_part(bodies, pair[0]) + dynamic_part(bodies, pair[1])))
     units.impulse = units.mass * speed
@@ -170,6 +173,16 @@ def friction_of(a: Side, b: Side, point: RelaxedPoint, most: wp.float32, slide: 
 
 
 @wp.func
+def half_shift(pair: wp.vec2i, bodies: Bodies):
+    """Return half of how far the second object of a pair has moved more than the first, cut to the bounding radius.
+
+    So no impulse acts far off bodies that a step takes far.
+    """
+    shift, most = HALF * (bodies.moved[pair[1]] - bodies.moved[pair[0]]), radius_of(bodies, pair)
+    return wp.min(most / wp.max(wp.length(shift), most), ONE) * shift
+
+
+@wp.func
 def load_point(
     relaxation: Relaxation,
     units: Units,
@@ -185,10 +198,11 @@ def load_point(
 
     Its impulses act in the middle of where both objects have taken it.
     """
-    a, b, slop = pair[0], pair[1], constraints.slop[p]
+    a, b, slop = pair[0], pair[1], slop_of(bodies, pair)
     n, first_a, first_b = manifolds.normal[p, k], constraints.arm_a[p, k], constraints.arm_b[p, k]
     shift = bodies.moved[b] - bodies.moved[a]
-    arm_a, arm_b = first_a + HALF * shift, first_b - HALF * shift
+    half = half_shift(pair, bodies)
+    arm_a, arm_b = first_a + half, first_b - half
     moved = shift + wp.cross(bodies.turned[b], first_b) - wp.cross(bodies.turned[a], first_a)
     room = relaxation.rest * slop - manifolds.depth[p, k] + wp.dot(n, moved)
     velocity = velocity_at(bodies, b, arm_b) - velocity_at(bodies, a, arm_a)
@@ -212,7 +226,8 @@ def relax_point(
     b: Side,
     change_a: Change,
     change_b: Change,
-    softens: bool,
+    corrects: bool,
+    struck: wp.int32,
     friction: wp.float32,
 ):
     """Relax a point, and return its impulse and the part along the normal."""
@@ -220,7 +235,7 @@ def relax_point(
     at_a = change_a.velocity + wp.cross(change_a.turning, point.arm_a)
     velocity = point.velocity + (change_b.velocity + wp.cross(change_b.turning, point.arm_b) - at_a)
     excess = wp.dot(n, velocity) + point.approach
-    soft = wp.where(softens and point.is_deep, wp.float32(SOFTNESS), 0.0)
+    soft = wp.where(struck != 0, SHORTFALL, wp.where(corrects and point.is_deep, wp.float32(SOFTNESS), 0.0))
     after = wp.max((1.0 - soft) * (before - point.mass * excess), 0.0)
     more = after - before
     velocity += more * point.response

@@ -1,7 +1,8 @@
 """Relaxation of contact constraints: projected Gauss-Seidel (sequential impulses), one color of pairs after another.
 
 A step has substeps, each of which begins with the impulses of the one before, solves for velocities that also take
-penetrating points apart, moves the bodies, and relaxes: removes what took points apart from the velocities again.
+penetrating points apart, relaxes: removes that from the velocities again, and moves the bodies by both. What moves and
+relaxes at one place adds no energy.
 Points that penetrate are springs, stiff for the length of a substep, so that a stack finds its balance.
 Source: Macklin et al. 2019, Small Steps in Physics Simulation; Catto 2024, Solver2D ("soft step").
 
@@ -32,6 +33,7 @@ from warp_abtree.kernels.bodies.relaxed_points import (
     Units,
     act_at_point,
     add_of_lanes,
+    half_shift,
     load_point,
     load_side,
     make_units,
@@ -90,7 +92,7 @@ def relax_pair(
     hold the changes of both objects. A pair is struck if it meets fast where a pass begins.
     """
     stage, count, backward, lanes = relaxation.stage, manifolds.count[p], relaxation.backward, warp_size()
-    units = make_units(relaxation.per_substep, constraints.slop[p], pair, bodies)
+    units = make_units(relaxation.per_substep, pair, bodies)
     a, b = load_side(units, bodies, pair[0]), load_side(units, bodies, pair[1])
     change_a, change_b = Change(), Change()
     # Without gravity two rigid bodies are not pushed apart, which would add energy.
@@ -118,8 +120,8 @@ def relax_pair(
             if lanes == 1:
                 point = relaxed[p, k]
             if lanes == 1 or resolve_lane() == k:
-                softens, friction = corrects and struck == 0, wp.float32(relaxation.friction)
-                impulse, more = relax_point(point, a, b, change_a, change_b, softens, friction)
+                friction = wp.float32(relaxation.friction)
+                impulse, more = relax_point(point, a, b, change_a, change_b, corrects, struck, friction)
                 changes = changes or wp.abs(more) > settled * point.mass
                 moment_a = wp.cross(point.arm_a, impulse)
                 moment_b = wp.cross(point.arm_b, impulse)
@@ -133,6 +135,9 @@ def relax_pair(
     apply_impulses(units, p, pair, point, manifolds, constraints, bodies, relaxed)
     if resolve_lane() == 0:
         constraints.is_struck[p] = struck
+        if corrects:
+            for k in range(2):
+                bodies.corrects[pair[k]] = 1
     warp_sync()
 
 
@@ -149,7 +154,7 @@ def apply_impulses(
 ):
     """Write the impulses of a pair's points, and give both objects what is new of them: no momentum is lost."""
     count, unit = manifolds.count[p], units.impulse
-    half = HALF * (bodies.moved[pair[1]] - bodies.moved[pair[0]])
+    half = half_shift(pair, bodies)
     total = PairImpulse()
     for first in range(0, count, warp_size()):
         own, k = PairImpulse(), first + resolve_lane()
@@ -179,7 +184,7 @@ def hand_on_impulses(p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constrai
     These are not what the next substep needs: little of them may lift a body.
     """
     count, struck = manifolds.count[p], constraints.is_struck[p]
-    half = HALF * (bodies.moved[pair[1]] - bodies.moved[pair[0]])
+    half = half_shift(pair, bodies)
     total = PairImpulse()
     for first in range(0, count, warp_size()):
         own, k = PairImpulse(), first + resolve_lane()

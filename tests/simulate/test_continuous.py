@@ -227,6 +227,21 @@ def test_a_body_that_strikes_the_floor_stays_there(device, speed):
     assert np.abs(dynamics.velocities()[0][1]).max() < 0.01 and dynamics.certified.fraction.numpy()[1] == 1
 
 
+@pytest.mark.parametrize("speed", [1e6, 1e7, 1e9, 1e11, 1e14, 1e24])
+def test_bodies_meet_at_any_speed_and_gain_no_energy(device, speed):
+    """The first step ends where they meet, however small a part of it that is."""
+    placed = (TORUS, (-1, 0, 0, *about((1, 0, 0), 0.5))), (BRICK, (1, 0.1, 0.05, *about((0, 1, 0), 0.3)))
+    dynamics = make(device, *placed, velocity=[(speed, 0, 0), (-speed, 0, 0)], continuous=True, **FREE)
+    before, slop = energy(dynamics, 0), dynamics.bodies.slop.numpy().min()
+    dynamics.step(1 / 60)
+    assert 0 < dynamics.scene.intersect([(0, 1)], output="distance").distance[0] < 0.02 + slop
+    for _ in range(20):
+        dynamics.step(1 / 60)
+        after = energy(dynamics, 0)
+        assert after <= (1 + 1e-12) * before and not surfaces_meet(dynamics)
+        before = after
+
+
 BOX = model_of(trimesh.creation.box((0.8, 0.6, 0.4)))
 FINE_TORUS = model_of(trimesh.creation.torus(0.5, 0.2, 64, 16))
 FINE_BALL = model_of(trimesh.creation.icosphere(4, 0.5))

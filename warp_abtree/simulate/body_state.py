@@ -16,6 +16,9 @@ from warp_abtree.scene.posed_objects import expect_scene
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.poses import check_poses, launch_place
 
+SLOP, SLOP_OF_THICKNESS = 2.0**-9, 0.25
+"""Penetration that matters little, as a fraction of the bounding radius, and of the thickness at most."""
+
 FIRST_STEP = 1 / 60
 """Length of a step [s] before the first one is known."""
 
@@ -45,9 +48,10 @@ class MassProperties:
     moments: np.ndarray  # principal moments of inertia about the centre, ascending, float64 (3,)
     axes: np.ndarray  # principal axes, a rotation matrix with unit columns, float64 (3, 3)
     bounding_radius: float  # largest distance of a vertex from the centre [units]
+    thickness: float  # least extent along a principal axis [units]
 
 
-IMMOVABLE = MassProperties(np.inf, np.zeros(3), np.full(3, np.inf), np.eye(3), np.inf)
+IMMOVABLE = MassProperties(np.inf, np.zeros(3), np.full(3, np.inf), np.eye(3), np.inf, np.inf)
 """What stands for the mass properties of an object that is no rigid body."""
 
 
@@ -89,6 +93,7 @@ def mass_properties(model: Model) -> MassProperties:
         moments=moments * size**5,
         axes=axes,
         bounding_radius=float(radius * size),
+        thickness=float(np.ptp(mesh.vertices @ axes, axis=0).min() * size),
     )
 
 
@@ -110,7 +115,7 @@ class RigidBodies(DeviceMemory):
         targets: `ObjectPool` of the poses that kinematic objects have at the end of the next step.
     """
 
-    def __init__(self, scene: Scene, gravity, kinematic, velocity, angular_velocity):
+    def __init__(self, scene: Scene, gravity, kinematic, velocity, angular_velocity, rests_apart):
         self.scene, self.device, n = expect_scene(scene), scene.device, scene.object_count
         self._pool = pool = scene.batch().objects.pool
         self.gravity = finite_array(gravity, "gravity", (3,))
@@ -125,6 +130,7 @@ class RigidBodies(DeviceMemory):
         own = [found[m] if r else IMMOVABLE for m, r in zip(scene.object_model, self.rigid)]
         self.mass, self._moments = np.array([one.volume for one in own]), np.array([one.moments for one in own])
         self._axes, centre = np.array([one.axes for one in own]), np.array([one.centre for one in own])
+        radius, thickness = (np.array([getattr(one, name) for one in own]) for name in ("bounding_radius", "thickness"))
         rank = np.zeros(n, np.int64)
         rank[self.rigid] = _ranks(pool.world.numpy()[self.rigid])
         rotation, rigid, frames = pool.rotation.numpy(), self.rigid[:, None], self._frames()
@@ -137,12 +143,13 @@ class RigidBodies(DeviceMemory):
             "inverse_moment": 1 / self._moments,
             "centre": centre,
             "axes": self._axes,
-            "bounding_radius": np.array([one.bounding_radius for one in own]),
+            "bounding_radius": radius,
+            "slop": SLOP * radius if rests_apart else np.minimum(SLOP * radius, SLOP_OF_THICKNESS * thickness),
             "position": pool.position.numpy() + np.einsum("nij,nj->ni", rotation, centre),
             "rotation": quaternions_of(frames),
             "velocity": np.where(rigid, velocity, 0.0),
             "momentum": np.einsum("nij,nj->ni", frames, local),
-            "reach": self._first_reach(velocity, angular_velocity, [one.bounding_radius for one in own]),
+            "reach": self._first_reach(velocity, angular_velocity, radius),
         }.items():
             getattr(self.bodies, name).assign(values)
         self.targets = ObjectPool()

@@ -12,9 +12,7 @@ from warp_abtree.query.stages.intersect import IntersectStage
 from warp_abtree.query.stages.motion import FirstContactStage
 from warp_abtree.scene.scene import Scene
 
-TIME_TOLERANCE = 2.0**-24  # of times, as a fraction of a step's motion
 INTEGERS = [(name, wp.int32) for name in ("is_changed", "is_held")]
-SOLVED = [(name, wp.vec3d) for name in ("solved", "solved_momentum")]
 ROUND_MODES = kernels.CUT, kernels.MATCH, kernels.HOLD_BOTH, kernels.CERTIFY
 # What each round does with the pairs that it does not prove clear.
 ROUNDS = [int(mode) for mode, times in zip(ROUND_MODES, (5, 4, 3, 1)) for _ in range(times)]
@@ -32,7 +30,7 @@ class MotionRounds(FirstContactStage):
     """
 
     def __init__(self, bodies):
-        super().__init__(TIME_TOLERANCE)
+        super().__init__(float(kernels.TIME_TOLERANCE))
         self._bodies, self.goals, self.state = bodies, ObjectPool(), kernels.StepMotions()
 
     def attach(self, operator: Operator):
@@ -41,7 +39,7 @@ class MotionRounds(FirstContactStage):
         self._pool, n, state = operator.batch.objects.pool, operator.batch.object_count, self.state
         self.goals.rotation, self.goals.position = wp.clone(self._pool.rotation), wp.clone(self._pool.position)
         state.goals, state.ends = self.goals, self.ends
-        for name, dtype in (("fraction", wp.float64), ("cut", wp.float64), *SOLVED, *INTEGERS):
+        for name, dtype in (("fraction", wp.float64), ("cut", wp.float64), *INTEGERS):
             setattr(state, name, wp.zeros(n, dtype=dtype, device=operator.device))
         state.counter = wp.zeros(3, dtype=wp.int32, device=operator.device)
 
@@ -112,14 +110,6 @@ class CertifiedMotions(Operator):
         """Aim motions at their goals, and launch broad phase, exact test and rounds."""
         self._rounds.begin()
         super().launch_search(between)
-
-    def keep_solved(self):
-        """Keep the velocities that a substep solved for. Launches only."""
-        self._rounds.launch(kernels.keep_solved_kernel, len(self.fraction), [self._bodies, self._state])
-
-    def free_stuck(self, h: float):
-        """Move the bodies that were stuck in the last step, after a substep. Launches only."""
-        self._rounds.launch(kernels.free_stuck_kernel, len(self.fraction), [h, self._state, self._bodies])
 
     def end(self, velocity_change):
         """Pose objects where their motions end, unless there was no room for all pairs. Launches only.

@@ -1,9 +1,9 @@
 """Rigid bodies that respond to the contacts of their meshes: `Dynamics`.
 
 One step: contacts where the bodies stand, and where they first meet as far ahead as they move; substeps of gravity,
-contact impulses by projected Gauss-Seidel with warm starting and Coulomb friction, soft where points penetrate, motion
-by semi-implicit Euler with a symplectic rotation, and relaxation; with `continuous`, motions cut where surfaces would
-meet. All in float64; docs/dynamics.md has each part, what is conserved and repeated, figures, and limits.
+contact impulses by projected Gauss-Seidel with warm starting and Coulomb friction, soft where points penetrate,
+relaxation, and motion by semi-implicit Euler with rotations that keep energy; with `continuous`, motions cut where
+surfaces would meet. docs/dynamics.md has each part, what is conserved and repeated, figures, and limits.
 """
 
 from contextlib import contextmanager
@@ -24,7 +24,7 @@ from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT
 from warp_abtree.query.request import Buffers, check_capacity
 from warp_abtree.query.stages.points import POINTS_MAX, ManifoldQuery
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.body_state import RigidBodies
+from warp_abtree.simulate.body_state import SLOP, RigidBodies
 from warp_abtree.simulate.contacts_ahead import AheadGapStage
 from warp_abtree.simulate.continuous import CertifiedMotions
 
@@ -79,7 +79,7 @@ class Dynamics(RigidBodies):
         continuous: bool = False,
         remember: bool | float = False,
     ):
-        super().__init__(scene, gravity, kinematic, velocity, angular_velocity)
+        super().__init__(scene, gravity, kinematic, velocity, angular_velocity, flag(continuous, "continuous"))
         self.friction = float(finite_array(friction, "friction", ()))
         if self.friction < 0:
             raise ValueError(f"friction {friction!r} is below 0")
@@ -87,10 +87,10 @@ class Dynamics(RigidBodies):
         self._by_color = not self.device.is_cpu if by_color is None else by_color
         self.query = ManifoldQuery(scene, None, capacity, gap=AheadGapStage(scene, self.bodies), remember=remember)
         self.certified = None
-        if flag(continuous, "continuous"):
+        if continuous:
             self.certified = CertifiedMotions(scene, self.bodies, Buffers(pairs=check_capacity(capacity).pairs))
-        radii = self.bodies.bounding_radius.numpy()[self.rigid]
-        self._least_slop = float(constraint_kernels.SLOP) * radii.min(initial=np.inf)
+        slop, radius = self.bodies.slop.numpy(), self.bodies.bounding_radius.numpy()
+        self._least_slop, self._thin_slop = slop.min(initial=np.inf), np.where(slop < SLOP * radius, slop, np.inf)
         # No body is in two pairs of a color; more warps than run at a time would wait.
         warps = RELAXING_WARPS * self.device.sm_count if self.device.is_cuda else len(self.rigid)
         self._color_warps = max(1, min(warps, int(np.count_nonzero(self.rigid))))
@@ -138,7 +138,7 @@ class Dynamics(RigidBodies):
                 objects count, which rotate by less than half a turn. None leaves them where they are.
 
         Raises:
-            ValueError: A step that is not above 0, or bad poses; nothing is changed.
+            ValueError: A step that is not above 0 or too long for a thin body, or bad poses; nothing is changed.
             RuntimeError: Objects were added to the scene, or a step was interrupted.
             CapacityError: More contacts than can be numbered.
         """
@@ -150,9 +150,16 @@ class Dynamics(RigidBodies):
     def substeps(self, dt: float) -> int:
         """Return how many substeps a step has: more the longer it is, and the smaller its smallest body.
 
-        A contact gives by about twice the square of a substep times gravity for each body borne.
+        A contact gives by about twice the square of a substep times gravity for each body borne. Raises ValueError
+        where that is much of the thickness of a thin body, which would pass through what it rests on.
         """
-        wanted = dt * np.sqrt(2.0 * np.linalg.norm(self.gravity) / (GIVE * self._least_slop))
+        pull = dt * np.sqrt(2.0 * np.linalg.norm(self.gravity) / GIVE)
+        wanted, thin = pull / np.sqrt(self._least_slop), pull / np.sqrt(self._thin_slop)
+        if thin.max(initial=0.0) > SUBSTEPS_MAX:
+            name = self.scene.name(int(thin.argmax()))
+            longest = dt * SUBSTEPS_MAX / thin.max()
+            what = f"dt {dt:.3g} is too long for body {name!r}, which is thin: it would fall through others"
+            raise ValueError(f"{what}; use steps of {longest:.2g} at most, or continuous=True")
         return int(np.clip(np.ceil(wanted), SUBSTEPS_LEAST, SUBSTEPS_MAX))
 
     def find(self, targets=None):
@@ -194,15 +201,13 @@ class Dynamics(RigidBodies):
             self._launch(constraint_kernels.prepare_constraints_kernel, room, inputs)
             self._color_pairs()
             self._relax(each, solve.WARM_START)
-            for _ in range(substeps):
-                self._launch(body_kernels.begin_substep_kernel, n, [wp.vec3d(*(h * self.gravity)), bodies])
-                self._relax(each, solve.SOLVE)
-                self._launch(body_kernels.move_bodies_kernel, n, [h, bodies])
-                if self.certified is not None:
-                    self.certified.keep_solved()
-                self._relax(each, solve.RELAX)
-                if self.certified is not None:
-                    self.certified.free_stuck(h)
+            for turn in range(substeps + 1):
+                inputs = [h if turn else 0.0, int(turn < substeps), wp.vec3d(*(h * self.gravity)), bodies]
+                self._launch(body_kernels.move_bodies_kernel, n, inputs)
+                if turn < substeps:
+                    self._relax(each, solve.SOLVE)
+                    self._launch(body_kernels.keep_solved_kernel, n, [bodies])
+                    self._relax(each, solve.RELAX)
             inputs = [query.broad_phase.key, *posed, self.constraints, bodies, self._warm_start]
             self._launch(constraint_kernels.save_impulses_kernel, room, inputs)
             posed = self._pool if self.certified is None else self.certified.goals
@@ -224,7 +229,7 @@ class Dynamics(RigidBodies):
         Where contacts or pairs outrun the capacity nothing moves; `check` raises then.
 
         Raises:
-            ValueError: A step that is not above 0.
+            ValueError: A step that is not above 0, or too long for a thin body.
             RuntimeError: As `step`.
         """
         dt = positive(dt, "dt")
