@@ -179,7 +179,9 @@ def half_shift(pair: wp.vec2i, bodies: Bodies):
     So no impulse acts far off bodies that a step takes far.
     """
     shift, most = HALF * (bodies.moved[pair[1]] - bodies.moved[pair[0]]), radius_of(bodies, pair)
-    return wp.min(most / wp.max(wp.length(shift), most), ONE) * shift
+    if not wp.length_sq(shift) <= most * most:
+        shift = (most / wp.length(shift)) * shift
+    return shift
 
 
 @wp.func

@@ -23,9 +23,9 @@ from warp_abtree.state.generation import LaunchGuard
 EVERY_WORLD = -1
 # Tasks of warps at most, of sorted objects, but for what their number needs.
 SORTED_TASKS = 2**20
-# Warps share the objects of a tile where there are no more tasks, since each waits for one object after the other; of
-# one task they would find pairs in an order that changes.
-SHARED_TASKS, SHARING_WARPS = 2**14, 4
+# Warps that share the objects of a tile at most, and all warps then; of sorted objects, of which most find nothing.
+# Each waits for one object after the other. Of one task they would find pairs in an order that changes.
+SHARING_WARPS, WARPS_AT_ONCE, SORTED_WARPS = 8, 2**13, 2**15
 # Launches before the sort: boxes, their bounds, and keys.
 SORT_AFTER = 3
 
@@ -140,7 +140,9 @@ class TileSearch:
             dim = self._lanes * self._tile_count
             made.append(launch(box_tiles.bound_tile_kernel, dim=dim, inputs=[found.bounds, self.tiles], **warps))
         pool = found.batch.objects.pool
-        parts = SHARING_WARPS if self._lanes > 1 and 1 < len(self._tasks) <= SHARED_TASKS else 1
+        at_once, parts = SORTED_WARPS if self.sorts else WARPS_AT_ONCE, 1
+        if self._lanes > 1 and len(self._tasks) > 1:
+            parts = max(1, min(SHARING_WARPS, at_once // len(self._tasks)))
         inputs = [parts, self._tasks, found.filter, self.tiles, pool, found.bounds, found.pairs]
         dim = self._lanes * parts * len(self._tasks)
         made.append(launch(box_tiles.find_tile_pair_kernel, dim=dim, inputs=inputs, **warps))
