@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from helpers.bodies import about, model_of
+from helpers.bodies import about, box, model_of
 from helpers.scenes import scene_with
 from oracles.triangle import quaternion_matrix
 
@@ -91,3 +91,14 @@ def test_edges_along_one_another_have_points_at_the_ends_of_what_they_share(devi
         ends = np.array([max(-1, 2 * shift / length - 1), min(1, 2 * shift / length + 1)]) * length / 2
         told.append((t + ends[:, None] * r[:, 0], r[:, 2], height))
     assert not [told[k] for k, found in enumerate(points_of(device, placed)) if wrong_ends(found, *told[k])]
+
+
+def test_a_corner_over_a_floor_has_its_nearest_point_whatever_the_gap(device):
+    """Edges that cross aslant do not pass for nearer than it."""
+    rng, floor, cube, placed, heights = np.random.default_rng(3), grid(4 * GAP, 4 * GAP, 16), box(GAP, GAP, GAP), [], []
+    for part in np.repeat([0.01, 0.1, 0.3, 0.5, 0.9], 30):
+        turn, heights = about(rng.normal(size=3), rng.uniform(0.3, 3)), [*heights, part * GAP]
+        lowest = -np.abs(quaternion_matrix(turn)[2]).sum() * GAP / 2
+        placed.append(((floor, STILL), (cube, (*rng.uniform(-GAP, GAP, 2) / 2, part * GAP - lowest, *turn))))
+    for (_, _, depth), height in zip(points_of(device, placed), heights):
+        assert depth.max(initial=-np.inf) >= -height * (1 + 1e-3) - 2e-3 * GAP

@@ -27,16 +27,18 @@ struct EdgeOffer {
             c.a[2] = first;
         }
     }
-    // Rates the points over one another of edges that cross, seen along a normal: corners of what faces share.
+    // Rates the points over one another of edges that cross, seen along a normal: corners of what faces share. None is
+    // nearer than the faces, as seen aslant it would be.
     static CUDA_CALLABLE void offer_crossings(const N::Corners& c, const Point& normal, float gap, float weight,
-                                              const lanes& slack, const bits& counts, Scores& scores) {
+                                              const lanes& distance, const lanes& slack, const bits& counts,
+                                              Scores& scores) {
         visit_edges(c, [&](const Point& p, const Point& e, const Point& r, const Point& f) {
             lanes s;
             const Point v = N::between_edges(r, e, f, N::invert(F::dot(e, e)), N::invert(F::dot(f, f)), s);
             const lanes height = F::dot(v, normal), square = height * height;
             const bits over = F::dot(v, v) <= F::fuse(square, lanes{} + (1.0f + 0x1p-6f), slack * slack);
             const bits near = (height <= gap) & (height >= -gap);
-            scores.offer(weight, vector_of(N::add(p, s, e)), height, counts & over & near);
+            scores.offer(weight, vector_of(N::add(p, s, e)), N::most(height, distance), counts & over & near);
         });
     }
     // Rates the ends of what edges share that are parallel: the nearest points from either end of one.

@@ -140,7 +140,7 @@ struct NearOffer {
         const lanes slack = size * 0x1p-20f;
         if (F::any(over)) {
             const Point up = F::choose(over_b, down, joined.normal_a);
-            EdgeOffer<Scores>::offer_crossings(c, up, gap, weight, slack, over, scores);
+            EdgeOffer<Scores>::offer_crossings(c, up, gap, weight, distance, slack, over, scores);
         }
         if (F::any(edges))
             EdgeOffer<Scores>::offer_ends(c, weight, distance * (1.0f + 0x1p-10f) + slack, edges, scores);
