@@ -76,6 +76,7 @@ def integrate_rotation(q: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d
 
     In the body frame the implicit midpoint rule keeps all quadratic invariants of the momentum m. Where Newton's method
     fails, for turns by more than a radian, a turn about m keeps them as well.
+    Source: Austin, Krishnaprasad and Wang 1993, Almost Poisson Integration of Rigid Body Systems.
     """
     size = wp.length(momentum)
     if size == ZERO or size == wp.float64(wp.inf):

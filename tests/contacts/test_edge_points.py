@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from helpers.bodies import about, box, model_of
+from helpers.bodies import about, box, model_of, open_floor
 from helpers.scenes import scene_with
 from oracles.triangle import quaternion_matrix
 
@@ -22,12 +22,8 @@ def wedge(angle, length, points_down=True):
 
 
 def grid(width, length, count):
-    """Return an open floor of so many squares a side, of two faces each."""
-    x, y = np.meshgrid(*(np.linspace(-size / 2, size / 2, count + 1) for size in (width, length)), indexing="ij")
-    first = (np.arange(count)[:, None] * (count + 1) + np.arange(count)).ravel()
-    squares = np.stack([first, first + 1, first + count + 1, first + count + 2], axis=1)
-    vertices = np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])
-    return ab.Model.from_arrays(vertices, np.concatenate([squares[:, [0, 2, 3]], squares[:, [0, 3, 1]]]))
+    """Return an open floor about the origin of so many cells a side."""
+    return open_floor((count, count), (-width / 2, -length / 2), (width / 2, length / 2))
 
 
 def lowered(width, length, splits):

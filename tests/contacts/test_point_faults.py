@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import slow_rows
-from helpers.bodies import about, box, make
+from helpers.bodies import about, box, make, open_floor, plain_model
 from helpers.samples import STILL
 from oracles.triangle import quaternion_matrix
 
@@ -25,20 +25,6 @@ FLOORS_AND_HEIGHTS += slow_rows(*(("24,000 faces", height) for height in (0.0, 1
 # The object with the lower index, and the one that the pair names first.
 ORDERS = (("floor", "floor"), ("shape", "shape"), ("floor", "shape"))
 TILT = np.array([0.31, -0.52, 0.23, 0.76]) / np.linalg.norm([0.31, -0.52, 0.23, 0.76])
-
-
-def plain_model(vertices, faces):
-    return ab.Model.from_arrays(np.asarray(vertices, float), np.asarray(faces), base_faces=len(faces))
-
-
-def open_floor(cells, low, high):
-    """Return a floor in the plane z = 0 of two faces a cell, between two corners."""
-    x, y = (np.linspace(a, b, n + 1) for a, b, n in zip(low, high, cells))
-    vertices = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((len(x), len(y)))], -1).reshape(-1, 3)
-    index = np.arange(len(vertices)).reshape(len(x), len(y))
-    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
-    faces = np.concatenate([np.stack(part, -1).reshape(-1, 3) for part in ((a, b, c), (a, c, d))])
-    return plain_model(vertices, faces)
 
 
 @cache

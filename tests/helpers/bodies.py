@@ -22,6 +22,20 @@ def box(*extents, splits=0):
     return model_of(mesh)
 
 
+def plain_model(vertices, faces):
+    return ab.Model.from_arrays(np.asarray(vertices, float), np.asarray(faces), base_faces=len(faces))
+
+
+def open_floor(cells, low, high):
+    """Return a floor in the plane z = 0 of two faces a cell, between two corners."""
+    x, y = (np.linspace(a, b, n + 1) for a, b, n in zip(low, high, cells))
+    vertices = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((len(x), len(y)))], -1).reshape(-1, 3)
+    index = np.arange(len(vertices)).reshape(len(x), len(y))
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    faces = np.concatenate([np.stack(part, -1).reshape(-1, 3) for part in ((a, b, c), (a, c, d))])
+    return plain_model(vertices, faces)
+
+
 CUBE, BRICK, GROUND = box(1, 1, 1), box(1, 0.7, 0.5), box(8, 8, 1)
 BALL = model_of(trimesh.creation.icosphere(1, 0.5))
 TORUS = model_of(trimesh.creation.torus(0.5, 0.2, 8, 6))

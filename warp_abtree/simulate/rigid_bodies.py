@@ -90,7 +90,9 @@ class Dynamics(RigidBodies):
         if continuous:
             self.certified = CertifiedMotions(scene, self.bodies, Buffers(pairs=check_capacity(capacity).pairs))
         slop, radius = self.bodies.slop.numpy(), self.bodies.bounding_radius.numpy()
-        self._least_slop, self._thin_slop = slop.min(initial=np.inf), np.where(slop < SLOP * radius, slop, np.inf)
+        thin = np.where(slop < SLOP * radius, slop, np.inf)
+        self._thinnest, self._thin_slop = int(thin.argmin()) if len(thin) else 0, thin.min(initial=np.inf)
+        self._least_slop = slop.min(initial=np.inf)
         # No body is in two pairs of a color; more warps than run at a time would wait.
         warps = RELAXING_WARPS * self.device.sm_count if self.device.is_cuda else len(self.rigid)
         self._color_warps = max(1, min(warps, int(np.count_nonzero(self.rigid))))
@@ -142,7 +144,7 @@ class Dynamics(RigidBodies):
             RuntimeError: Objects were added to the scene, or a step was interrupted.
             CapacityError: More contacts than can be numbered.
         """
-        dt = positive(dt, "dt")
+        dt = self._check_step(dt)
         self.find(targets)
         self.answer(dt)
         self.finish(dt)
@@ -150,17 +152,24 @@ class Dynamics(RigidBodies):
     def substeps(self, dt: float) -> int:
         """Return how many substeps a step has: more the longer it is, and the smaller its smallest body.
 
-        A contact gives by about twice the square of a substep times gravity for each body borne. Raises ValueError
-        where that is much of the thickness of a thin body, which would pass through what it rests on.
+        A contact gives by about twice the square of a substep times gravity for each body borne.
+
+        Raises:
+            ValueError: That is much of the thickness of a thin body, which would pass through what it rests on.
         """
         pull = dt * np.sqrt(2.0 * np.linalg.norm(self.gravity) / GIVE)
-        wanted, thin = pull / np.sqrt(self._least_slop), pull / np.sqrt(self._thin_slop)
-        if thin.max(initial=0.0) > SUBSTEPS_MAX:
-            name = self.scene.name(int(thin.argmax()))
-            longest = dt * SUBSTEPS_MAX / thin.max()
-            what = f"dt {dt:.3g} is too long for body {name!r}, which is thin: it would fall through others"
-            raise ValueError(f"{what}; use steps of {longest:.2g} at most, or continuous=True")
+        wanted, thin = (pull / np.sqrt(slop) for slop in (self._least_slop, self._thin_slop))
+        if thin > SUBSTEPS_MAX:
+            what = f"dt {dt:.3g} is too long for body {self.scene.name(self._thinnest)!r}, which is thin: it would fall"
+            longest = dt * SUBSTEPS_MAX / thin
+            raise ValueError(f"{what} through others; use steps of {longest:.2g} at most, or continuous=True")
         return int(np.clip(np.ceil(wanted), SUBSTEPS_LEAST, SUBSTEPS_MAX))
+
+    def _check_step(self, dt) -> float:
+        """Return the length of a step, or raise before anything is changed."""
+        dt = positive(dt, "dt")
+        self.substeps(dt)
+        return dt
 
     def find(self, targets=None):
         """Do the first half of `step`: find the contacts where the bodies stand, without moving them."""
@@ -232,7 +241,7 @@ class Dynamics(RigidBodies):
             ValueError: A step that is not above 0, or too long for a thin body.
             RuntimeError: As `step`.
         """
-        dt = positive(dt, "dt")
+        dt = self._check_step(dt)
         self._check_whole()
         with self.query.guard.launching(self):
             self.query.launch()

@@ -13,28 +13,23 @@ struct CandidateWriter {
     const Objects& objects;
     const Witnesses& witnesses;
     wp::int32 a, w;
-    double least, slack;  // depth of the least deep corner; one that lacks no more than `slack` counts as so deep
-    int place;
+    double least, slack;     // depth of the least deep corner; one that lacks no more than `slack` counts as so deep
+    double most = INFINITY;  // depth that none exceeds
+    int place = 0;
 
     CUDA_CALLABLE void write_normal(const C::Point& n) const {
         witnesses.normal.data[w] = vector_of(C::turn(objects.rotation.data[a].data, n));
     }
     CUDA_CALLABLE void write_corners(const C::Column& column) {
         column.visit(*this);
-        fill_corners(INFINITY);
-    }
-    // Says that there are no more; none is deeper.
-    CUDA_CALLABLE void fill_corners(double most) const {
-        for (int k = 0; k < COLUMN_CORNERS; ++k) {
-            double& depth = witnesses.depth.data[(wp::int64)COLUMN_CORNERS * w + k];
-            depth = k < place ? C::lesser(depth, most) : NAN;
-        }
+        for (int k = place; k < COLUMN_CORNERS; ++k)
+            witnesses.depth.data[(wp::int64)COLUMN_CORNERS * w + k] = NAN;
     }
     CUDA_CALLABLE void offer(const C::Point& point, double depth, bool exists) {
         if (!exists || depth < least - slack || place == COLUMN_CORNERS)
             return;
         const wp::int64 k = (wp::int64)COLUMN_CORNERS * w + place++;
-        witnesses.depth.data[k] = C::greater(depth, least);
+        witnesses.depth.data[k] = C::lesser(C::greater(depth, least), most);
         witnesses.point.data[k] = vector_of(C::pose(objects.rotation.data[a].data, objects.position.data[a], point));
     }
 };
@@ -45,7 +40,7 @@ CUDA_CALLABLE bool find_crossing(const Objects& objects, const Pair& pair, wp::v
     typedef OneCrossing C;
     const C::Crossing contact = crossing_of(objects, pair, loop, has_area, gap, scale);
     const C::Measured best = contact.measure();
-    CandidateWriter<Objects, Witnesses> writer = {objects, witnesses, pair.object, w, contact.least, best.slack, 0};
+    CandidateWriter<Objects, Witnesses> writer = {objects, witnesses, pair.object, w, contact.least, best.slack};
     writer.write_normal(best.normal);
     const bool has_depth = best.depth > C::no_depth();
     if (has_depth)
@@ -81,7 +76,7 @@ CUDA_CALLABLE bool find_facing(const Objects& objects, const Pair& pair, wp::flo
     }
     const bool serves = fabs(fabs(best.depth) - separation) <= slack;
     if (serves) {
-        CandidateWriter<Objects, Witnesses> writer = {objects, witnesses, pair.object, w, -gap, 0.0, 0};
+        CandidateWriter<Objects, Witnesses> writer = {objects, witnesses, pair.object, w, -gap, 0.0};
         witnesses.nearest_only.data[w] = best.depth > slack;
         writer.write_normal(best.normal);
         writer.write_corners(C::Column(faces, best.normal, normal_a, normal_b));
@@ -99,14 +94,13 @@ CUDA_CALLABLE bool find_along_edges(const Objects& objects, const Pair& pair, wp
                            C::turn_back(rotation, point_of(pair.normal_a)),
                            C::turn_back(rotation, point_of(pair.normal_b)));
     const double rounding = C::find_slack(faces), least = -separation - C::greater(ALIKE * separation, rounding);
-    CandidateWriter<Objects, Witnesses> writer = {objects, witnesses, pair.object, w, least, 0.0, 0};
+    CandidateWriter<Objects, Witnesses> writer = {objects, witnesses, pair.object, w, least, 0.0, -separation};
     if (!column.looks)
         return false;
-    column.visit(writer);
+    writer.write_corners(column);
     const wp::vec3d* const found = witnesses.point.data + (wp::int64)COLUMN_CORNERS * w;
     bool shared = false;
     for (int k = 1; k < writer.place; ++k)
         shared |= wp::length(found[k] - found[0]) > rounding * (ALIKE / COLUMN_ROUNDING);
-    writer.fill_corners(-separation);
     return shared;
 }

@@ -9,7 +9,7 @@
 constexpr float LOOKS_AT = -0.5f;
 // Farther than any point.
 constexpr float FAR_AWAY = 0x1p60f;
-// Faces look away from one another whose normals have no lower product than this, negative.
+// Faces look away from one another whose normals have a product that is no less.
 constexpr float LOOKS_AWAY = -0x1p-10f;
 // Of the smaller object's size: of parallel faces that are no smaller it counts where their edges cross.
 constexpr float LARGE_FACE = 0x1p-3f;
@@ -70,12 +70,12 @@ struct NearOffer {
     static CUDA_CALLABLE lanes face_size(const Point (&c)[3]) {
         return N::most(N::largest(F::minus(c[1], c[0])), N::largest(F::minus(c[2], c[0])));
     }
-    // Whether a face lies in front of a plane.
-    static CUDA_CALLABLE bits is_ahead(const Point (&c)[3], const Point& of, const Point& normal, const lanes& size) {
+    // Whether a face lies in front of a plane, or within a slack of it.
+    static CUDA_CALLABLE bits is_ahead(const Point (&c)[3], const Point& of, const Point& normal, const lanes& slack) {
         lanes lowest = F::dot(F::minus(c[0], of), normal);
         for (int k = 1; k < 3; ++k)
             lowest = N::least(lowest, F::dot(F::minus(c[k], of), normal));
-        return lowest >= size * -0x1p-20f;
+        return lowest >= -slack;
     }
     static CUDA_CALLABLE Scores rate(const N::Corners& c, float gap, float weight, const float* directions) {
         const lanes zero = {};
@@ -86,30 +86,31 @@ struct NearOffer {
         joined.at = joined.way = Point{zero, zero, zero};
         joined.count = 0;
         const lanes size = N::visit(c, joined), distance = F::root(joined.square);
+        const lanes slack = size * 0x1p-20f;
         const lanes ahead_a = F::dot(joined.way, joined.normal_a), ahead_b = -F::dot(joined.way, joined.normal_b);
         const lanes product = F::dot(joined.normal_a, joined.normal_b);
         const bits facing = product <= LOOKS_AT;
         // Along a normal, or so near that normals tell the direction.
         const lanes least = distance * 0x1p-6f, straight = distance * 0.99f;
         const lanes most = N::most(F::absolute(ahead_a), F::absolute(ahead_b));
-        const bits touches = distance <= size * 0x1p-20f, column = facing & (touches | (most >= straight));
+        const bits touches = distance <= slack, column = facing & (touches | (most >= straight));
         // An edge or a corner that stands over the other face, and not along it.
         const bits tilted = (product < LOOKS_AWAY) & (product > (float)-ALONG),
                    ahead = (ahead_a > least) & (ahead_b > least);
         bits over_a = tilted & ahead & (ahead_a >= straight), over_b = tilted & ahead & (ahead_b >= straight);
         if (F::any(tilted & touches)) {
-            over_a = touches ? tilted & is_ahead(c.b, c.a[0], joined.normal_a, size) : over_a;
-            over_b = touches ? tilted & is_ahead(c.a, c.b[0], joined.normal_b, size) : over_b;
+            over_a = touches ? tilted & is_ahead(c.b, c.a[0], joined.normal_a, slack) : over_a;
+            over_b = touches ? tilted & is_ahead(c.a, c.b[0], joined.normal_b, slack) : over_b;
         }
         over_b = over_a ? bits{} : over_b;
         const bits along = column | touches | over_a | over_b,
-                   inside = column & (distance > size * 0x1p-20f) & (ahead_a < 0.0f) & (ahead_b < 0.0f);
+                   inside = column & (distance > slack) & (ahead_a < 0.0f) & (ahead_b < 0.0f);
         const lanes separation = inside ? -distance : distance;
         // What lies deeper inside than its distance is not measured by it (`near_points`).
         lanes lowest = zero;
         for (int k = 0; k < 6; ++k)
             lowest = joined.height[k] < lowest ? joined.height[k] : lowest;
-        const bits fits = (separation >= 0.0f) | (-lowest <= distance * (1.0f + 0x1p-10f) + size * 0x1p-20f);
+        const bits fits = (separation >= 0.0f) | (-lowest <= distance * (1.0f + 0x1p-10f) + slack);
         const bits counts = (distance <= gap) & fits & (along | ahead);
         if (!F::any(counts)) {
             Scores none;
@@ -137,7 +138,6 @@ struct NearOffer {
         }
         const bits over = counts & large & ((shared & (product <= (float)-ALONG)) | over_a | over_b),
                    edges = counts & large & (along == 0);
-        const lanes slack = size * 0x1p-20f;
         if (F::any(over)) {
             const Point up = F::choose(over_b, down, joined.normal_a);
             EdgeOffer<Scores>::offer_crossings(c, up, gap, weight, distance, slack, over, scores);
