@@ -13,7 +13,7 @@ from warp_abtree.kernels.bodies.constraints import Constraints, velocity_at
 from warp_abtree.kernels.contacts.manifold import Manifolds
 from warp_abtree.kernels.triangle.distance import largest_coordinate, power_below
 
-wp.set_module_options(native.options("base/lanes.cuh"))
+wp.set_module_options(native.options("base/lanes.cuh", "bodies/impulses.cuh"))
 
 _FREQUENCY = 1.0  # angle that a point's spring would swing by in a substep [rad]
 _RESPONSE = 2.0 * 10.0 + _FREQUENCY  # twice its damping ratio, and that
@@ -96,6 +96,16 @@ class PairImpulse:
     moment_b: wp.vec3d  # about that of the second
 
 
+@native.func_native()
+def divide32(a: wp.float32, b: wp.float32) -> wp.float32:
+    """Return a / b without branches, 0 where b is not between 2^-126 and 2^125."""
+
+
+@native.func_native()
+def root32(x: wp.float32) -> wp.float32:
+    """Return the square root without branches."""
+
+
 @wp.func
 def dynamic_part(bodies: Bodies, i: wp.int32):
     """Return the inverse mass of an object, 0 if impulses do not move it."""
@@ -164,11 +174,10 @@ def friction_of(a: Side, b: Side, point: RelaxedPoint, most: wp.float32, slide: 
         return wp.vec3()
     response = wp.dot(slide, response_of(a, point.arm_a, slide) + response_of(b, point.arm_b, slide))
     wanted = wp.vec3(point.across)
-    if response > 0.0:
-        wanted -= (wp.dot(slide, slide) / response) * slide
+    wanted -= divide32(wp.dot(slide, slide), response) * slide
     square = wp.dot(wanted, wanted)
     if square > most * most:
-        wanted = (most / wp.sqrt(square)) * wanted
+        wanted = divide32(most, root32(square)) * wanted
     return wanted
 
 

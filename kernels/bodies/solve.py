@@ -33,6 +33,7 @@ from warp_abtree.kernels.bodies.relaxed_points import (
     Units,
     act_at_point,
     add_of_lanes,
+    divide32,
     half_shift,
     load_point,
     load_side,
@@ -43,7 +44,7 @@ from warp_abtree.kernels.bodies.relaxed_points import (
 )
 from warp_abtree.kernels.contacts.manifold import Manifolds
 
-wp.set_module_options(native.options("base/lanes.cuh"))
+wp.set_module_options(native.options("base/lanes.cuh", "bodies/impulses.cuh"))
 
 WARM_START = wp.constant(0)
 SOLVE = wp.constant(1)
@@ -102,7 +103,7 @@ def relax_pair(
     for k in range(resolve_lane(), count, lanes):
         point, speed = load_point(relaxation, units, corrects, p, k, pair, manifolds, constraints, bodies)
         point.response = response_of(a, point.arm_a, point.normal) + response_of(b, point.arm_b, point.normal)
-        point.mass = 1.0 / wp.dot(point.normal, point.response)
+        point.mass = divide32(1.0, wp.dot(point.normal, point.response))
         fastest = wp.max(fastest, speed)
         if lanes == 1:
             relaxed[p, k] = point

@@ -2,6 +2,9 @@
 #pragma once
 #include "builtin.h"
 
+// Between these numbers reciprocals are normal, rounded to nearest; of others they are 0.
+constexpr float INVERTED_LEAST = 0x1p-126f, INVERTED_MOST = 0x1p125f;
+
 #if defined(__CUDA_ARCH__)
 struct Float32 {
     typedef float lanes;
@@ -16,14 +19,34 @@ struct Float32 {
         return Point{fuse(u.y, v.z, -(u.z * v.y)), fuse(u.z, v.x, -(u.x * v.z)), fuse(u.x, v.y, -(u.y * v.x))};
     }
     static CUDA_CALLABLE float dot(const Point& u, const Point& v) { return fuse(u.x, v.x, fuse(u.y, v.y, u.z * v.z)); }
-    static CUDA_CALLABLE float root(float v) { return sqrtf(v); }
+    // As IEEE, without the branches that division and root have for what is not normal.
+    static CUDA_CALLABLE float invert(float v) {
+        float r;
+        asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(v));
+        r = fuse(r, fuse(-v, r, 1.0f), r);
+        return ((v > INVERTED_LEAST) & (v < INVERTED_MOST)) ? r : 0.0f;
+    }
+    static CUDA_CALLABLE float root(float v) {
+        const bool tiny = v < 0x1p-96f;
+        const float x = tiny ? v * 0x1p64f : v;
+        float r;
+        asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
+        const float near = x * r, y = fuse(fuse(-near, near, x), 0.5f * r, near);
+        return (v == 0.0f) | (v == INFINITY) ? v : tiny ? y * 0x1p-32f : y;
+    }
+    static CUDA_CALLABLE float divide(float a, float b) {
+        const float inverse = invert(b), near = a * inverse;
+        return inverse == 0.0f ? 0.0f : fuse(fuse(-b, near, a), inverse, near);
+    }
     static CUDA_CALLABLE float first(float v) { return v; }
     static CUDA_CALLABLE int first(int v) { return v; }
     static CUDA_CALLABLE bool any(bool flag) { return flag; }
     static CUDA_CALLABLE float pick(const float* from, int at) { return from[at]; }
     static CUDA_CALLABLE Point choose(bool which, const Point& a, const Point& b) { return which ? a : b; }
     static CUDA_CALLABLE float sum_sizes(const Point& v) { return (absolute(v.x) + absolute(v.y)) + absolute(v.z); }
-    static CUDA_CALLABLE float largest(float x, float y, float z) { return wp::max(x, wp::max(y, z)); }
+    static CUDA_CALLABLE float most(float a, float b) { return fmaxf(a, b); }
+    static CUDA_CALLABLE float least(float a, float b) { return fminf(a, b); }
+    static CUDA_CALLABLE float largest(float x, float y, float z) { return most(x, most(y, z)); }
 };
 #else
 struct Float32 {
@@ -39,7 +62,13 @@ struct Float32 {
     };
 
     static lanes every(float v) { return lanes{v, v, v, v, v, v, v, v, v, v, v, v, v, v, v, v}; }
+    static lanes invert(const lanes& v) { return ((v > INVERTED_LEAST) & (v < INVERTED_MOST)) ? 1.0f / v : lanes{}; }
     static lanes root(const lanes& v) { return __builtin_elementwise_sqrt(v); }
+    static float root(float v) { return __builtin_sqrtf(v); }
+    static float divide(float a, float b) {
+        const float inverse = first(invert(every(b))), near = a * inverse;
+        return inverse == 0.0f ? 0.0f : fuse(fuse(-b, near, a), inverse, near);
+    }
     static float first(const lanes& v) { return v[0]; }
     static int first(const bits& v) { return v[0]; }
     static bool any(const bits& flags) { return to_mask(flags) != 0; }
@@ -56,7 +85,10 @@ struct Float32 {
             x[k] = from[at[k]];
         return x;
     }
-    static lanes absolute(const lanes& v) { return __builtin_elementwise_abs(v); }
+    template <class Lanes>
+    static Lanes absolute(const Lanes& v) {
+        return __builtin_elementwise_abs(v);
+    }
     static lanes fuse(const lanes& a, const lanes& b, const lanes& c) { return __builtin_elementwise_fma(a, b, c); }
     static float fuse(float a, float b, float c) { return __builtin_fmaf(a, b, c); }
     static eight fuse(const eight& a, const eight& b, const eight& c) { return __builtin_elementwise_fma(a, b, c); }
@@ -66,10 +98,12 @@ struct Float32 {
         return Point{fuse(u.y, v.z, -(u.z * v.y)), fuse(u.z, v.x, -(u.x * v.z)), fuse(u.x, v.y, -(u.y * v.x))};
     }
     static lanes dot(const Point& u, const Point& v) { return fuse(u.x, v.x, fuse(u.y, v.y, u.z * v.z)); }
-    static lanes largest(const lanes& x, const lanes& y, const lanes& z) {
-        const lanes m = y > z ? y : z;
-        return x > m ? x : m;
+    template <class Lanes>
+    static Lanes most(const Lanes& a, const Lanes& b) {
+        return a > b ? a : b;
     }
+    static lanes least(const lanes& a, const lanes& b) { return a < b ? a : b; }
+    static lanes largest(const lanes& x, const lanes& y, const lanes& z) { return most(x, most(y, z)); }
     static Point choose(const bits& which, const Point& a, const Point& b) {
         return Point{which ? a.x : b.x, which ? a.y : b.y, which ? a.z : b.z};
     }

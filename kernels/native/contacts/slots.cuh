@@ -20,16 +20,20 @@ struct SlotScores {
     static CUDA_CALLABLE L dot(const Vector& u, const Vector& v) {
         return Float32::fuse(u.x, v.x, Float32::fuse(u.y, v.y, u.z * v.z));
     }
-    // Nine times the bin of a normal. Directions: normals of bins and two vectors across each, by component.
+    // Nine times the bin of a normal. Directions: normals of bins and two vectors across each, by component; two bins
+    // each have opposite normals.
     static CUDA_CALLABLE I find_bin(const Vector& n, const float* directions) {
         L best = L{} + NO_SCORE;
         I bin = I{};
         for (int k = 0; k < NORMAL_BINS; ++k) {
+            const int opposite = k ^ (k < 8 ? 7 : 3);
+            if (opposite < k)
+                continue;
             const float* d = directions + 9 * k;
-            const L cosine = dot(n, Vector{L{} + d[0], L{} + d[1], L{} + d[2]});
+            const L along = dot(n, Vector{L{} + d[0], L{} + d[1], L{} + d[2]}), cosine = Float32::absolute(along);
             const auto more = cosine > best;
             best = more ? cosine : best;
-            bin = more ? I{} + 9 * k : bin;
+            bin = more ? (along >= 0.0f ? I{} + 9 * k : I{} + 9 * opposite) : bin;
         }
         return bin;
     }
@@ -43,14 +47,14 @@ struct SlotScores {
             score[k] = L{} + NO_SCORE;
     }
     CUDA_CALLABLE void offer(float weight, const Vector& point, const L& separation, const B& counts) {
-        const L x = dot(across[0], point) * weight, y = dot(across[1], point) * weight, depth = -separation;
-        const L sum = (x + y) * 0.70710678f, difference = (x - y) * 0.70710678f, none = L{} + NO_SCORE;
+        // No score is -0. What does not count is so deep that reach is lost in rounding.
+        const L x = dot(across[0], point) * weight, y = dot(across[1], point) * weight;
+        const L depth = counts ? L{} - separation : L{} + NO_SCORE;
+        const L sum = (x + y) * 0.70710678f, difference = (x - y) * 0.70710678f;
         const L along[SCORES] = {depth,       depth + x,   depth - x,          depth + y,         depth - y,
                                  depth + sum, depth - sum, depth + difference, depth - difference};
-        for (int k = 0; k < SCORES; ++k) {
-            const L found = counts ? along[k] : none;
-            score[k] = found > score[k] ? found : score[k];
-        }
+        for (int k = 0; k < SCORES; ++k)
+            score[k] = Float32::most(along[k], score[k]);
     }
 };
 

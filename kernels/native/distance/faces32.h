@@ -11,10 +11,10 @@ struct NearestFaces {
     struct Corners {
         Point a[3], b[3];
     };
-    static CUDA_CALLABLE lanes most(const lanes& a, const lanes& b) { return a > b ? a : b; }
-    static CUDA_CALLABLE lanes least(const lanes& a, const lanes& b) { return a < b ? a : b; }
+    static CUDA_CALLABLE lanes most(const lanes& a, const lanes& b) { return F::most(a, b); }
+    static CUDA_CALLABLE lanes least(const lanes& a, const lanes& b) { return F::least(a, b); }
     static CUDA_CALLABLE lanes clamp(const lanes& x) { return least(most(x, lanes{}), lanes{} + 1.0f); }
-    static CUDA_CALLABLE lanes invert(const lanes& x) { return x > 0x1p-126f ? 1.0f / x : lanes{}; }
+    static CUDA_CALLABLE lanes invert(const lanes& x) { return F::invert(x); }
     static CUDA_CALLABLE Point add(const Point& p, const lanes& s, const Point& v) {
         return Point{F::fuse(s, v.x, p.x), F::fuse(s, v.y, p.y), F::fuse(s, v.z, p.z)};
     }
@@ -26,7 +26,7 @@ struct NearestFaces {
         return Point{minor(u.y, v.z, u.z, v.y), minor(u.z, v.x, u.x, v.z), minor(u.x, v.y, u.y, v.x)};
     }
     static CUDA_CALLABLE lanes largest(const Point& p) {
-        return most(most(F::absolute(p.x), F::absolute(p.y)), F::absolute(p.z));
+        return F::largest(F::absolute(p.x), F::absolute(p.y), F::absolute(p.z));
     }
 
     // From edge e to f, r from its start to that of f, and the parameter on e.

@@ -1,0 +1,83 @@
+"""Reciprocals, quotients and roots in float32 without branches: rounded as IEEE's, the same on every device."""
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels import native
+
+wp.set_module_options(native.options("bodies/impulses.cuh"))
+
+LEAST, MOST = np.float32(2.0**-126), np.float32(2.0**125)
+
+
+@native.func_native()
+def divide32(a: wp.float32, b: wp.float32) -> wp.float32: ...
+
+
+@native.func_native()
+def root32(x: wp.float32) -> wp.float32: ...
+
+
+@wp.kernel
+def divide_kernel(a: wp.array[wp.float32], b: wp.array[wp.float32], out: wp.array[wp.float32]):
+    i = wp.tid()
+    out[i] = divide32(a[i], b[i])
+
+
+@wp.kernel
+def root_kernel(x: wp.array[wp.float32], out: wp.array[wp.float32]):
+    i = wp.tid()
+    out[i] = root32(x[i])
+
+
+def launch(kernel, device, *given):
+    """Return what a kernel writes for numbers."""
+    out = wp.empty(len(given[0]), dtype=wp.float32, device=device)
+    arrays = [wp.array(x, dtype=wp.float32, device=device) for x in given]
+    wp.launch(kernel, dim=len(out), inputs=[*arrays, out], device=device)
+    return out.numpy()
+
+
+def all_mantissas():
+    """Return all numbers from 1 to 2."""
+    return (np.arange(2**23, dtype=np.uint32) + np.uint32(0x3F800000)).view(np.float32)
+
+
+def random_numbers(rng, count, least, most):
+    """Return numbers of either sign with exponents of a range."""
+    return np.ldexp(rng.uniform(1, 2, count) * rng.choice([-1, 1], count), rng.integers(least, most, count)).astype(
+        np.float32
+    )
+
+
+def assert_same_bits(found, expected):
+    wrong = np.flatnonzero(found.view(np.uint32) != expected.view(np.uint32))
+    assert len(wrong) == 0, (found[wrong[:3]], expected[wrong[:3]])
+
+
+def test_reciprocals_of_all_mantissas(device):
+    x = all_mantissas()
+    for scale in (np.float32(2.0**-60), np.float32(1), np.float32(2.0**124)):
+        assert_same_bits(launch(divide_kernel, device, np.ones_like(x), x * scale), np.float32(1) / (x * scale))
+
+
+def test_quotients(device):
+    rng = np.random.default_rng(0)
+    a, b = random_numbers(rng, 10**6, -40, 40), np.abs(random_numbers(rng, 10**6, -40, 40))
+    a[:9] = 0.0
+    assert_same_bits(launch(divide_kernel, device, a, b), a / b)
+
+
+def test_no_quotient_by_what_is_not_normal(device):
+    b = np.array([0.0, -1.0, 2.0**-140, LEAST, MOST, np.inf, -np.inf, np.nan], np.float32)
+    assert (launch(divide_kernel, device, np.ones_like(b), b)[:-1] == 0).all()
+
+
+def test_roots(device):
+    rng = np.random.default_rng(1)
+    x = all_mantissas()
+    numbers = [x, 2 * x, np.abs(random_numbers(rng, 10**5, -149, 127))]
+    numbers.append(np.array([0.0, -0.0, 2.0**-149, 2.0**-96, np.inf], np.float32))
+    for some in numbers:
+        assert_same_bits(launch(root_kernel, device, some), np.sqrt(some))
+    assert np.isnan(launch(root_kernel, device, np.array([-1.0, -(2.0**-140), np.nan], np.float32))).all()
