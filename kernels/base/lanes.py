@@ -59,6 +59,11 @@ def first_lane(flag: bool) -> wp.int32:
 
 
 @native.func_native()
+def lane_in_turn(flag: bool, backward: bool) -> wp.int32:
+    """Return the first lane, or backward the last one, that has set its flag, -1 where none has."""
+
+
+@native.func_native()
 def warp_size() -> wp.int32: ...
 
 

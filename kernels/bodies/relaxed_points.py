@@ -232,7 +232,7 @@ def load_point(
 
 @wp.func
 def relax_point(
-    point: wp.ref[RelaxedPoint],
+    point: RelaxedPoint,
     a: Side,
     b: Side,
     change_a: Change,
@@ -241,21 +241,16 @@ def relax_point(
     struck: wp.int32,
     friction: wp.float32,
 ):
-    """Relax a point, and return its impulse and the part along the normal."""
-    n, before = wp.vec3(point.normal), wp.float32(point.along)
+    """Return the impulses along and across the normal that relax a point."""
+    n, before = point.normal, point.along
     at_a = change_a.velocity + wp.cross(change_a.turning, point.arm_a)
     velocity = point.velocity + (change_b.velocity + wp.cross(change_b.turning, point.arm_b) - at_a)
     excess = wp.dot(n, velocity) + point.approach
     soft = wp.where(struck != 0, SHORTFALL, wp.where(corrects and point.is_deep, wp.float32(SOFTNESS), 0.0))
     after = wp.max((1.0 - soft) * (before - point.mass * excess), 0.0)
-    more = after - before
-    velocity += more * point.response
+    velocity += (after - before) * point.response
     most = wp.where(point.is_apart, 0.0, friction * after)
-    wanted = friction_of(a, b, point, most, velocity - wp.dot(n, velocity) * n)
-    impulse = more * n + (wanted - point.across)
-    point.along = after
-    point.across = wanted
-    return impulse, more
+    return after, friction_of(a, b, point, most, velocity - wp.dot(n, velocity) * n)
 
 
 @wp.func

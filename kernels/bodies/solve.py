@@ -14,6 +14,7 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.lanes import (
     block_sync,
+    lane_in_turn,
     resolve_lane,
     vector_of_lane,
     warp_any,
@@ -114,23 +115,34 @@ def relax_pair(
     visit, visits = wp.int32(0), most_visits(relaxation.fast, fastest)
     while visit < visits:
         visit += 1
-        changes = bool(False)
-        for i in range(count):
-            k = point_of_turn(i, count, backward)
-            impulse, moment_a, moment_b = wp.vec3(), wp.vec3(), wp.vec3()
+        changes, turn = bool(False), wp.int32(0)
+        while turn < count:
+            # All lanes try their points at once, since most change nothing: the next that does has its turn.
+            k = point_of_turn(turn, count, backward)
             if lanes == 1:
                 point = relaxed[p, k]
-            if lanes == 1 or resolve_lane() == k:
-                friction = wp.float32(relaxation.friction)
-                impulse, more = relax_point(point, a, b, change_a, change_b, corrects, struck, friction)
-                changes = changes or wp.abs(more) > settled * point.mass
-                moment_a = wp.cross(point.arm_a, impulse)
-                moment_b = wp.cross(point.arm_b, impulse)
-            if lanes == 1:
-                relaxed[p, k] = point
-            impulse = vector_of_lane(impulse, k)
-            change_a = push(a, change_a, -impulse, -vector_of_lane(moment_a, k))
-            change_b = push(b, change_b, impulse, vector_of_lane(moment_b, k))
+            else:
+                k = resolve_lane()
+            friction = wp.float32(relaxation.friction)
+            along, across = relax_point(point, a, b, change_a, change_b, corrects, struck, friction)
+            more, slides = along - point.along, across - point.across
+            acts = k < count and point_of_turn(k, count, backward) >= turn and (more != 0.0 or wp.norm_l1(slides) != 0.0)
+            acting = lane_in_turn(acts, backward != 0)
+            turn += lanes
+            if acting >= 0:
+                k = wp.where(lanes == 1, k, acting)
+                turn = point_of_turn(k, count, backward) + 1
+                impulse = more * point.normal + slides
+                moment_a, moment_b = wp.cross(point.arm_a, impulse), wp.cross(point.arm_b, impulse)
+                if lanes == 1 or resolve_lane() == k:
+                    changes = changes or wp.abs(more) > settled * point.mass
+                    point.along = along
+                    point.across = across
+                if lanes == 1:
+                    relaxed[p, k] = point
+                impulse = vector_of_lane(impulse, k)
+                change_a = push(a, change_a, -impulse, -vector_of_lane(moment_a, k))
+                change_b = push(b, change_b, impulse, vector_of_lane(moment_b, k))
         if visit >= VISITS_LEAST and not warp_any(changes):
             visit = visits
     apply_impulses(units, p, pair, point, manifolds, constraints, bodies, relaxed)

@@ -177,6 +177,15 @@ inline CUDA_CALLABLE wp::int32 count_lanes(bool flag) {
 #endif
 }
 
+inline CUDA_CALLABLE wp::int32 lane_in_turn(bool flag, bool backward) {
+#if defined(__CUDA_ARCH__)
+    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
+    return backward ? 31 - __clz(votes) : __ffs(votes) - 1;
+#else
+    return flag ? 0 : -1;
+#endif
+}
+
 inline CUDA_CALLABLE wp::int32 first_lane(bool flag) {
 #if defined(__CUDA_ARCH__)
     const unsigned int votes = __ballot_sync(0xffffffffu, flag);
