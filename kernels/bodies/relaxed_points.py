@@ -8,12 +8,13 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.lanes import vector64_of_lane
 from warp_abtree.kernels.base.poses import HALF
+from warp_abtree.kernels.base.quotients import divide32, root32
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, ONE, ZERO, Bodies, radius_of, slop_of
 from warp_abtree.kernels.bodies.constraints import Constraints, velocity_at
 from warp_abtree.kernels.contacts.manifold import Manifolds
-from warp_abtree.kernels.triangle.distance import largest_coordinate, power_below
+from warp_abtree.kernels.triangle.distance import inverse_power, largest_coordinate, power_below
 
-wp.set_module_options(native.options("base/lanes.cuh", "bodies/impulses.cuh"))
+wp.set_module_options(native.options("base/lanes.cuh", "base/quotients.cuh"))
 
 _FREQUENCY = 1.0  # angle that a point's spring would swing by in a substep [rad]
 _RESPONSE = 2.0 * 10.0 + _FREQUENCY  # twice its damping ratio, and that
@@ -88,22 +89,25 @@ class RelaxedPoint:
 
 
 @wp.struct
+class RelaxedPair:
+    """A pair while its points are relaxed, in its units."""
+
+    a: Side  # first object
+    b: Side  # second object
+    change_a: Change  # of the first one's motion
+    change_b: Change  # of the second one's
+    corrects: wp.bool  # whether points that are too deep are to separate
+    struck: wp.int32  # 1 if it has met fast
+    settled: wp.float32  # change of speed that is not much
+
+
+@wp.struct
 class PairImpulse:
     """Sum of impulses of a pair's points."""
 
     impulse: wp.vec3d  # on the second object; the first has its opposite
     moment_a: wp.vec3d  # about the centre of mass of the first object
     moment_b: wp.vec3d  # about that of the second
-
-
-@native.func_native()
-def divide32(a: wp.float32, b: wp.float32) -> wp.float32:
-    """Return a / b without branches, 0 where b is not between 2^-126 and 2^125."""
-
-
-@native.func_native()
-def root32(x: wp.float32) -> wp.float32:
-    """Return the square root without branches."""
 
 
 @wp.func
@@ -116,11 +120,12 @@ def dynamic_part(bodies: Bodies, i: wp.int32):
 def make_units(per_substep: wp.float64, pair: wp.vec2i, bodies: Bodies):
     units = Units()
     units.length = power_below(radius_of(bodies, pair))
-    units.per_length = ONE / units.length
+    units.per_length = inverse_power(units.length)
     fastest = largest_coordinate(bodies.velocity[pair[1]] - bodies.velocity[pair[0]])
     speed = power_below(wp.max(slop_of(bodies, pair) * per_substep, fastest))
-    units.per_speed = ONE / speed
-    units.mass = power_below(ONE / (dynamic_part(bodies, pair[0]) + dynamic_part(bodies, pair[1])))
+    units.per_speed = inverse_power(speed)
+    lightness = dynamic_part(bodies, pair[0]) + dynamic_part(bodies, pair[1])
+    units.mass = HALF * inverse_power(power_below(lightness))
     units.impulse = units.mass * speed
     return units
 
@@ -217,7 +222,7 @@ def load_point(
     moved = shift + wp.cross(bodies.turned[b], first_b) - wp.cross(bodies.turned[a], first_a)
     room = relaxation.rest * slop - manifolds.depth[p, k] + wp.dot(n, moved)
     velocity = velocity_at(bodies, b, arm_b) - velocity_at(bodies, a, arm_a)
-    point, per_impulse = RelaxedPoint(), ONE / units.impulse
+    point, per_impulse = RelaxedPoint(), inverse_power(units.impulse)
     point.normal = wp.vec3(n)
     point.arm_a = wp.vec3(arm_a * units.per_length)
     point.arm_b = wp.vec3(arm_b * units.per_length)
@@ -231,26 +236,17 @@ def load_point(
 
 
 @wp.func
-def relax_point(
-    point: RelaxedPoint,
-    a: Side,
-    b: Side,
-    change_a: Change,
-    change_b: Change,
-    corrects: bool,
-    struck: wp.int32,
-    friction: wp.float32,
-):
+def relax_point(point: RelaxedPoint, own: RelaxedPair, friction: wp.float32):
     """Return the impulses along and across the normal that relax a point."""
     n, before = point.normal, point.along
-    at_a = change_a.velocity + wp.cross(change_a.turning, point.arm_a)
-    velocity = point.velocity + (change_b.velocity + wp.cross(change_b.turning, point.arm_b) - at_a)
+    at_a = own.change_a.velocity + wp.cross(own.change_a.turning, point.arm_a)
+    velocity = point.velocity + (own.change_b.velocity + wp.cross(own.change_b.turning, point.arm_b) - at_a)
     excess = wp.dot(n, velocity) + point.approach
-    soft = wp.where(struck != 0, SHORTFALL, wp.where(corrects and point.is_deep, wp.float32(SOFTNESS), 0.0))
+    soft = wp.where(own.struck != 0, SHORTFALL, wp.where(own.corrects and point.is_deep, wp.float32(SOFTNESS), 0.0))
     after = wp.max((1.0 - soft) * (before - point.mass * excess), 0.0)
     velocity += (after - before) * point.response
     most = wp.where(point.is_apart, 0.0, friction * after)
-    return after, friction_of(a, b, point, most, velocity - wp.dot(n, velocity) * n)
+    return after, friction_of(own.a, own.b, point, most, velocity - wp.dot(n, velocity) * n)
 
 
 @wp.func

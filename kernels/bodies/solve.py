@@ -23,18 +23,18 @@ from warp_abtree.kernels.base.lanes import (
     warp_sync,
 )
 from warp_abtree.kernels.base.poses import HALF, PairBatch
+from warp_abtree.kernels.base.quotients import divide32
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, ZERO, Bodies
 from warp_abtree.kernels.bodies.constraints import Constraints
 from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT
 from warp_abtree.kernels.bodies.relaxed_points import (
-    Change,
     PairImpulse,
     Relaxation,
+    RelaxedPair,
     RelaxedPoint,
     Units,
     act_at_point,
     add_of_lanes,
-    divide32,
     half_shift,
     load_point,
     load_side,
@@ -45,7 +45,7 @@ from warp_abtree.kernels.bodies.relaxed_points import (
 )
 from warp_abtree.kernels.contacts.manifold import Manifolds
 
-wp.set_module_options(native.options("base/lanes.cuh", "bodies/impulses.cuh"))
+wp.set_module_options(native.options("base/lanes.cuh", "base/quotients.cuh"))
 
 WARM_START = wp.constant(0)
 SOLVE = wp.constant(1)
@@ -79,6 +79,48 @@ def most_visits(fast: wp.float64, speed: wp.float64):
 
 
 @wp.func
+def visit_points(
+    relaxation: Relaxation,
+    p: wp.int32,
+    count: wp.int32,
+    own: wp.ref[RelaxedPair],
+    point: wp.ref[RelaxedPoint],
+    relaxed: wp.array2d(dtype=RelaxedPoint),
+):
+    """Relax the points of a pair once, one after the other; return whether any changes much.
+
+    All lanes try their points at once, since most change nothing: the next that does has its turn.
+    """
+    backward, lanes, turn, changes = relaxation.backward, warp_size(), wp.int32(0), bool(False)
+    while turn < count:
+        k = point_of_turn(turn, count, backward)
+        if lanes == 1:
+            point = relaxed[p, k]
+        else:
+            k = resolve_lane()
+        along, across = relax_point(point, own, wp.float32(relaxation.friction))
+        more, slides = along - point.along, across - point.across
+        acts = k < count and point_of_turn(k, count, backward) >= turn and (more != 0.0 or wp.norm_l1(slides) != 0.0)
+        acting = lane_in_turn(acts, backward != 0)
+        turn += lanes
+        if acting >= 0:
+            k = wp.where(lanes == 1, k, acting)
+            turn = point_of_turn(k, count, backward) + 1
+            impulse = more * point.normal + slides
+            moment_a, moment_b = wp.cross(point.arm_a, impulse), wp.cross(point.arm_b, impulse)
+            if lanes == 1 or resolve_lane() == k:
+                changes = changes or wp.abs(more) > own.settled * point.mass
+                point.along = along
+                point.across = across
+            if lanes == 1:
+                relaxed[p, k] = point
+            impulse = vector_of_lane(impulse, k)
+            own.change_a = push(own.a, own.change_a, -impulse, -vector_of_lane(moment_a, k))
+            own.change_b = push(own.b, own.change_b, impulse, vector_of_lane(moment_b, k))
+    return warp_any(changes)
+
+
+@wp.func
 def relax_pair(
     relaxation: Relaxation,
     p: wp.int32,
@@ -90,65 +132,39 @@ def relax_pair(
 ):
     """Relax the points of a pair: the normal velocity, then the tangential one within the friction cone.
 
-    The points are relaxed several times, one after the other: each by the lane of a warp that holds it, while all lanes
-    hold the changes of both objects. A pair is struck if it meets fast where a pass begins.
+    The points are relaxed several times, one after the other; a warp's lanes hold one each. A pair is struck if it
+    meets fast where a pass begins.
     """
-    stage, count, backward, lanes = relaxation.stage, manifolds.count[p], relaxation.backward, warp_size()
+    stage, count, lanes, own = relaxation.stage, manifolds.count[p], warp_size(), RelaxedPair()
     units = make_units(relaxation.per_substep, pair, bodies)
-    a, b = load_side(units, bodies, pair[0]), load_side(units, bodies, pair[1])
-    change_a, change_b = Change(), Change()
+    own.a = load_side(units, bodies, pair[0])
+    own.b = load_side(units, bodies, pair[1])
     # Without gravity two rigid bodies are not pushed apart, which would add energy.
-    corrects = stage == SOLVE and (relaxation.fast > ZERO or not (a.inverse_mass > 0.0 and b.inverse_mass > 0.0))
+    one_moves = not (own.a.inverse_mass > 0.0 and own.b.inverse_mass > 0.0)
+    own.corrects = stage == SOLVE and (relaxation.fast > ZERO or one_moves)
     point = RelaxedPoint()
     fastest = wp.float64(0.0)
     for k in range(resolve_lane(), count, lanes):
-        point, speed = load_point(relaxation, units, corrects, p, k, pair, manifolds, constraints, bodies)
-        point.response = response_of(a, point.arm_a, point.normal) + response_of(b, point.arm_b, point.normal)
+        point, speed = load_point(relaxation, units, own.corrects, p, k, pair, manifolds, constraints, bodies)
+        point.response = response_of(own.a, point.arm_a, point.normal) + response_of(own.b, point.arm_b, point.normal)
         point.mass = divide32(1.0, wp.dot(point.normal, point.response))
         fastest = wp.max(fastest, speed)
         if lanes == 1:
             relaxed[p, k] = point
     fastest = warp_max(fastest)
-    settled = wp.float32(SETTLED * relaxation.fast * units.per_speed)
-    struck = wp.where(stage == RELAX, constraints.is_struck[p], 0)
-    struck = wp.where(fastest > relaxation.fast, 1, struck)
+    own.settled = wp.float32(SETTLED * relaxation.fast * units.per_speed)
+    own.struck = wp.where(stage == RELAX, constraints.is_struck[p], 0)
+    own.struck = wp.where(fastest > relaxation.fast, 1, own.struck)
     visit, visits = wp.int32(0), most_visits(relaxation.fast, fastest)
     while visit < visits:
         visit += 1
-        changes, turn = bool(False), wp.int32(0)
-        while turn < count:
-            # All lanes try their points at once, since most change nothing: the next that does has its turn.
-            k = point_of_turn(turn, count, backward)
-            if lanes == 1:
-                point = relaxed[p, k]
-            else:
-                k = resolve_lane()
-            friction = wp.float32(relaxation.friction)
-            along, across = relax_point(point, a, b, change_a, change_b, corrects, struck, friction)
-            more, slides = along - point.along, across - point.across
-            acts = k < count and point_of_turn(k, count, backward) >= turn and (more != 0.0 or wp.norm_l1(slides) != 0.0)
-            acting = lane_in_turn(acts, backward != 0)
-            turn += lanes
-            if acting >= 0:
-                k = wp.where(lanes == 1, k, acting)
-                turn = point_of_turn(k, count, backward) + 1
-                impulse = more * point.normal + slides
-                moment_a, moment_b = wp.cross(point.arm_a, impulse), wp.cross(point.arm_b, impulse)
-                if lanes == 1 or resolve_lane() == k:
-                    changes = changes or wp.abs(more) > settled * point.mass
-                    point.along = along
-                    point.across = across
-                if lanes == 1:
-                    relaxed[p, k] = point
-                impulse = vector_of_lane(impulse, k)
-                change_a = push(a, change_a, -impulse, -vector_of_lane(moment_a, k))
-                change_b = push(b, change_b, impulse, vector_of_lane(moment_b, k))
-        if visit >= VISITS_LEAST and not warp_any(changes):
+        changes = visit_points(relaxation, p, count, own, point, relaxed)
+        if visit >= VISITS_LEAST and not changes:
             visit = visits
     apply_impulses(units, p, pair, point, manifolds, constraints, bodies, relaxed)
     if resolve_lane() == 0:
-        constraints.is_struck[p] = struck
-        if corrects:
+        constraints.is_struck[p] = own.struck
+        if own.corrects:
             for k in range(2):
                 bodies.corrects[pair[k]] = 1
     warp_sync()

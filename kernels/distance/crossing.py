@@ -25,7 +25,11 @@ from warp_abtree.kernels.triangle.corners import load_corners
 from warp_abtree.kernels.triangle.segment import intersect_faces
 
 MODULE_OPTIONS = native.options(
-    "base/lanes.cuh", "exact/determinant.cuh", "exact/expansion.cuh", "search/nearest_stack.cuh"
+    "base/lanes.cuh",
+    "base/quotients.cuh",
+    "exact/determinant.cuh",
+    "exact/expansion.cuh",
+    "search/nearest_stack.cuh",
 )
 wp.set_module_options(MODULE_OPTIONS)
 

@@ -59,6 +59,7 @@ from warp_abtree.kernels.triangle.triangle_pair import triangle_distance
 MODULE_OPTIONS = native.options(
     "base/counters.cuh",
     "base/lanes.cuh",
+    "base/quotients.cuh",
     "distance/bound_faces.cuh",
     "distance/warp_found.cuh",
     "search/load_balance.cuh",

@@ -12,6 +12,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.boxes import fuse32, map_point
 from warp_abtree.kernels.base.nodes import Node, load_constant
 from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.base.quotients import normalize32, root32
 from warp_abtree.kernels.distance.frame import SearchScale
 from warp_abtree.kernels.search.mean_slabs import Slabs
 from warp_abtree.kernels.search.slab_overlap import add_product, take_multiple
@@ -98,9 +99,9 @@ def direction_of(apart: wp.vec3, a: wp.vec3, b: wp.vec3):
         apart: Between their middles.
         a, b: Sums of unit normals, turned either way.
     """
-    c = wp.normalize(apart)
+    c = normalize32(apart)
     c = take_multiple(take_multiple(c, -NORMAL_WEIGHT * wp.dot(a, c), a), -NORMAL_WEIGHT * wp.dot(b, c), b)
-    return wp.normalize(c)
+    return normalize32(c)
 
 
 @wp.func
@@ -113,7 +114,7 @@ def bound_pair(n: wp.vec3, gap: wp.float32, margin: wp.float32, apart: wp.vec3, 
     """
     d = add_product(apart, n, 0.0)
     across = take_multiple(apart, d, n)
-    beside = wp.sqrt(add_product(across, across, 0.0)) - balls
+    beside = root32(add_product(across, across, 0.0)) - balls
     return wp.max(square_over(gap, margin) + square_over(beside, margin), boxes)
 
 

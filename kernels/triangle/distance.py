@@ -22,6 +22,8 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 GAP_ROUNDING = wp.constant(wp.float64(2.0**-46))
 POSE_ROUNDING = wp.constant(wp.float64(2.0**-45))
 DISTANCE_MAX = wp.constant(wp.float64(2.0**1000))
+# The sum of the bits of two powers of two whose product is 1.
+EXPONENTS_OF_ONE = wp.constant(wp.int64(2046 << 52))
 EXPONENT_BITS = wp.constant(wp.int64(0x7FF0000000000000))
 
 corners_type = wp.types.matrix(shape=(3, 3), dtype=wp.float64)
@@ -31,6 +33,12 @@ corners_type = wp.types.matrix(shape=(3, 3), dtype=wp.float64)
 def power_below(x: wp.float64):
     """Return the power of two at or below a number above 0, the exponent without the digits; 0 of 0."""
     return wp.cast(wp.cast(x, wp.int64) & EXPONENT_BITS, wp.float64)
+
+
+@wp.func
+def inverse_power(x: wp.float64):
+    """Return 1 / x, of a power of two from 2^-1022 to 2^1022, by its exponent."""
+    return wp.cast(EXPONENTS_OF_ONE - wp.cast(x, wp.int64), wp.float64)
 
 
 @wp.func

@@ -4,18 +4,11 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels import native
+from warp_abtree.kernels.base.quotients import divide32, normalize32, root32
 
-wp.set_module_options(native.options("bodies/impulses.cuh"))
+wp.set_module_options(native.options("base/quotients.cuh"))
 
 LEAST, MOST = np.float32(2.0**-126), np.float32(2.0**125)
-
-
-@native.func_native()
-def divide32(a: wp.float32, b: wp.float32) -> wp.float32: ...
-
-
-@native.func_native()
-def root32(x: wp.float32) -> wp.float32: ...
 
 
 @wp.kernel
@@ -30,10 +23,16 @@ def root_kernel(x: wp.array[wp.float32], out: wp.array[wp.float32]):
     out[i] = root32(x[i])
 
 
-def launch(kernel, device, *given):
-    """Return what a kernel writes for numbers."""
-    out = wp.empty(len(given[0]), dtype=wp.float32, device=device)
-    arrays = [wp.array(x, dtype=wp.float32, device=device) for x in given]
+@wp.kernel
+def normalize_kernel(v: wp.array[wp.vec3], out: wp.array[wp.vec3]):
+    i = wp.tid()
+    out[i] = normalize32(v[i])
+
+
+def launch(kernel, device, *given, dtype=wp.float32):
+    """Return what a kernel writes for numbers or vectors."""
+    out = wp.empty(len(given[0]), dtype=dtype, device=device)
+    arrays = [wp.array(x, dtype=dtype, device=device) for x in given]
     wp.launch(kernel, dim=len(out), inputs=[*arrays, out], device=device)
     return out.numpy()
 
@@ -81,3 +80,12 @@ def test_roots(device):
     for some in numbers:
         assert_same_bits(launch(root_kernel, device, some), np.sqrt(some))
     assert np.isnan(launch(root_kernel, device, np.array([-1.0, -(2.0**-140), np.nan], np.float32))).all()
+
+
+def test_unit_vectors(device):
+    v = np.random.default_rng(2).normal(size=(10**5, 3)).astype(np.float32)
+    for scale in (2.0**-50, 1.0, 2.0**50):
+        found = launch(normalize_kernel, device, v * np.float32(scale), dtype=wp.vec3)
+        expected = v / np.linalg.norm(v.astype(np.float64), axis=1, keepdims=True)
+        assert np.abs(found - expected).max() < 3 * 2.0**-23
+    assert not launch(normalize_kernel, device, np.zeros((1, 3), np.float32), dtype=wp.vec3).any()

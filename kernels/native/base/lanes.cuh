@@ -145,7 +145,8 @@ inline CUDA_CALLABLE wp::int32 value_of_lane(wp::int32 x, wp::int32 lane) {
 #endif
 }
 
-inline CUDA_CALLABLE wp::vec_t<3, wp::float64> vector64_of_lane(wp::vec_t<3, wp::float64> x, wp::int32 lane) {
+template <class Vector>
+CUDA_CALLABLE Vector vector_of_lane(Vector x, wp::int32 lane) {
 #if defined(__CUDA_ARCH__)
     for (int k = 0; k < 3; ++k)
         x[k] = __shfl_sync(0xffffffffu, x[k], lane);
@@ -153,13 +154,7 @@ inline CUDA_CALLABLE wp::vec_t<3, wp::float64> vector64_of_lane(wp::vec_t<3, wp:
     return x;
 }
 
-inline CUDA_CALLABLE wp::vec_t<3, wp::float32> vector_of_lane(wp::vec_t<3, wp::float32> x, wp::int32 lane) {
-#if defined(__CUDA_ARCH__)
-    for (int k = 0; k < 3; ++k)
-        x[k] = __shfl_sync(0xffffffffu, x[k], lane);
-#endif
-    return x;
-}
+inline CUDA_CALLABLE wp::vec3d vector64_of_lane(wp::vec3d x, wp::int32 lane) { return vector_of_lane(x, lane); }
 
 inline CUDA_CALLABLE wp::uint32 vote_lanes(bool flag) {
 #if defined(__CUDA_ARCH__)
