@@ -24,19 +24,27 @@ inline CUDA_CALLABLE void group_sync() {
 #endif
 }
 
-// The greatest number of all threads, and the item of a thread that has it, the least of several.
+// The greatest number of a warp, and the item of a lane that has it, the least of several.
 template <class Number>
-CUDA_CALLABLE void find_greatest(Number& x, int& item) {
+CUDA_CALLABLE void find_greatest_of_warp(Number& x, int& item) {
 #if defined(__CUDA_ARCH__)
-    __shared__ Number values[32];
-    __shared__ int items[32];
-    const int warps = blockDim.x >> 5;
     for (int step = 16; step > 0; step >>= 1) {
         const Number y = __shfl_xor_sync(0xffffffffu, x, step);
         const int other = __shfl_xor_sync(0xffffffffu, item, step);
         item = y > x || (y == x && other < item) ? other : item;
         x = wp::max(x, y);
     }
+#endif
+}
+
+// The greatest number of all threads, and its item.
+template <class Number>
+CUDA_CALLABLE void find_greatest(Number& x, int& item) {
+#if defined(__CUDA_ARCH__)
+    __shared__ Number values[32];
+    __shared__ int items[32];
+    const int warps = blockDim.x >> 5;
+    find_greatest_of_warp(x, item);
     __syncthreads();
     if ((threadIdx.x & 31) == 0) {
         values[threadIdx.x >> 5] = x;

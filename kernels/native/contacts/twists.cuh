@@ -37,6 +37,7 @@ struct TwistChoice {
         lanes separation;
     };
     static constexpr float RIM = 0.95f;
+    static constexpr int FEW_TWISTS = 8;
     const wp::vec4* wrenches;
     int first, end;
 
@@ -48,9 +49,11 @@ struct TwistChoice {
     static CUDA_CALLABLE lanes rate_of(const Twists& t, const Wrench& c) {
         return F::dot(t.linear, c.normal) + F::dot(t.angular, c.moment);
     }
-    CUDA_CALLABLE void find_worst(Twists& t) const {
+    // Of all candidates, or of every so many-th from one on.
+    CUDA_CALLABLE void find_worst(Twists& t, int from = 0, int step = 1) const {
         t.worst = lanes{} - 0x1p126f;
-        for (int k = first; k < end; ++k) {
+        t.candidate = integers{} + first;
+        for (int k = first + from; k < end; k += step) {
             const Wrench c = get(k);
             const lanes depth = F::fuse(-rate_of(t, c), t.stop, -c.separation);
             const auto deeper = depth > t.worst;
@@ -58,6 +61,30 @@ struct TwistChoice {
             t.candidate = deeper ? integers{} + k : t.candidate;
         }
     }
+#if defined(__CUDA_ARCH__)
+    // Of the twists of a warp that have changed: of few, by all lanes for one after the other.
+    CUDA_CALLABLE void find_worst_again(Twists& t, bool changed) const {
+        unsigned int left = __ballot_sync(0xffffffffu, changed);
+        if (__popc(left) > FEW_TWISTS && changed)
+            find_worst(t);
+        for (left = __popc(left) > FEW_TWISTS ? 0 : left; left != 0; left &= left - 1) {
+            const int owner = __ffs(left) - 1, lane = threadIdx.x & 31;
+            float x[7] = {t.linear.x, t.linear.y, t.linear.z, t.angular.x, t.angular.y, t.angular.z, t.stop};
+            for (int k = 0; k < 7; ++k)
+                x[k] = __shfl_sync(0xffffffffu, x[k], owner);
+            Twists one = {{x[0], x[1], x[2]}, {x[3], x[4], x[5]}, x[6]};
+            find_worst(one, lane, 32);
+            find_greatest_of_warp(one.worst, one.candidate);
+            t.worst = lane == owner ? one.worst : t.worst;
+            t.candidate = lane == owner ? one.candidate : t.candidate;
+        }
+    }
+#else
+    void find_worst_again(Twists& t, const integers& changed) const {
+        if (F::any(changed))
+            find_worst(t);
+    }
+#endif
     // Turns about a line across a normal, at the rim of the candidates in a direction: what only the outermost of them
     // stop. The first two components of a twist are the direction's, along two vectors across the normal.
     CUDA_CALLABLE void tilt(Twists& t, const float (&n)[3]) const {
@@ -95,8 +122,7 @@ struct TwistChoice {
         const lanes rate = rate_of(t, c), closing = -rate;
         const auto stops = (closing > 0x1p-20f) & (c.separation < t.stop * closing);
         t.stop = stops ? c.separation / closing : t.stop;
-        if (F::any(stops))
-            find_worst(t);
+        find_worst_again(t, stops);
     }
 };
 
