@@ -173,11 +173,11 @@ def move_object(i: wp.int32, h: wp.float64, bodies_inout: Bodies):
             turn += more
             after = wp.normalize(rotation_by(more) * after)
             bodies_inout.momentum[i] = without_gain(q, after, momentum, inverse) * momentum
-        bodies_inout.position[i] += step
+        bodies_inout.position[i] = bodies_inout.position[i] + step
         bodies_inout.rotation[i] = after
         bodies_inout.inverse_inertia[i] = world_inertia(after, inverse)
-    bodies_inout.moved[i] += step
-    bodies_inout.turned[i] += turn
+    bodies_inout.moved[i] = bodies_inout.moved[i] + step
+    bodies_inout.turned[i] = bodies_inout.turned[i] + turn
 
 
 @wp.kernel
@@ -194,8 +194,9 @@ def move_bodies_kernel(h: wp.float64, begins: wp.int32, velocity_change: wp.vec3
     if h > ZERO:
         move_object(i, h, bodies_inout)
     if begins != 0 and bodies_inout.motion_type[i] == DYNAMIC:
-        bodies_inout.velocity[i] += velocity_change + bodies_inout.inverse_mass[i] * bodies_inout.impulse[i]
-        bodies_inout.momentum[i] += bodies_inout.moment[i]
+        change = velocity_change + bodies_inout.inverse_mass[i] * bodies_inout.impulse[i]
+        bodies_inout.velocity[i] = bodies_inout.velocity[i] + change
+        bodies_inout.momentum[i] = bodies_inout.momentum[i] + bodies_inout.moment[i]
         bodies_inout.impulse[i] = wp.vec3d()
         bodies_inout.moment[i] = wp.vec3d()
 

@@ -169,7 +169,7 @@ def cut_way_kernel(
         wp.atomic_min(motions_inout.cut, b, wp.float64(2.0) * TIME_TOLERANCE)
         return
     if mode <= MATCH and contacts.time[p] == ZERO and motions_inout.level[p] < LAST_LEVEL:
-        motions_inout.level[p] += 1
+        motions_inout.level[p] = motions_inout.level[p] + 1
         motions_inout.is_again[p] = 1
         return
     if contacts.end[p] == UNDECIDED:

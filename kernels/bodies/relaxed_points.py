@@ -113,7 +113,8 @@ class PairImpulse:
 @wp.func
 def dynamic_part(bodies: Bodies, i: wp.int32):
     """Return the inverse mass of an object, 0 if impulses do not move it."""
-    return wp.where(bodies.motion_type[i] == DYNAMIC, bodies.inverse_mass[i], ZERO)
+    mass = bodies.inverse_mass[i]
+    return wp.where(bodies.motion_type[i] == DYNAMIC, mass, ZERO)
 
 
 @wp.func
@@ -132,13 +133,13 @@ def make_units(per_substep: wp.float64, pair: wp.vec2i, bodies: Bodies):
 
 @wp.func
 def load_side(units: Units, bodies: Bodies, i: wp.int32):
-    side = Side()
-    if bodies.motion_type[i] == DYNAMIC:
-        side.inverse_mass = wp.float32(bodies.inverse_mass[i] * units.mass)
-        inertia = bodies.inverse_inertia[i]
-        for j in range(3):
-            for k in range(3):
-                side.inverse_inertia[j, k] = wp.float32(inertia[j, k] * (units.mass * units.length * units.length))
+    # No branch: all loads are under way at once.
+    side, inertia = Side(), bodies.inverse_inertia[i]
+    side.inverse_mass = wp.float32(dynamic_part(bodies, i) * units.mass)
+    scale = wp.where(bodies.motion_type[i] == DYNAMIC, units.mass * units.length * units.length, ZERO)
+    for j in range(3):
+        for k in range(3):
+            side.inverse_inertia[j, k] = wp.float32(inertia[j, k] * scale)
     return side
 
 

@@ -199,11 +199,11 @@ def apply_impulses(
         total = add_of_lanes(total, own, wp.min(count - first, warp_size()))
     if resolve_lane() == 0:
         if bodies.motion_type[pair[0]] == DYNAMIC:
-            bodies.velocity[pair[0]] -= bodies.inverse_mass[pair[0]] * total.impulse
-            bodies.momentum[pair[0]] -= total.moment_a
+            bodies.velocity[pair[0]] = bodies.velocity[pair[0]] - bodies.inverse_mass[pair[0]] * total.impulse
+            bodies.momentum[pair[0]] = bodies.momentum[pair[0]] - total.moment_a
         if bodies.motion_type[pair[1]] == DYNAMIC:
-            bodies.velocity[pair[1]] += bodies.inverse_mass[pair[1]] * total.impulse
-            bodies.momentum[pair[1]] += total.moment_b
+            bodies.velocity[pair[1]] = bodies.velocity[pair[1]] + bodies.inverse_mass[pair[1]] * total.impulse
+            bodies.momentum[pair[1]] = bodies.momentum[pair[1]] + total.moment_b
 
 
 @wp.func
@@ -226,11 +226,11 @@ def hand_on_impulses(p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constrai
         total = add_of_lanes(total, own, wp.min(count - first, warp_size()))
     if resolve_lane() == 0:
         if bodies.motion_type[pair[0]] == DYNAMIC:
-            bodies.impulse[pair[0]] -= total.impulse
-            bodies.moment[pair[0]] -= total.moment_a
+            bodies.impulse[pair[0]] = bodies.impulse[pair[0]] - total.impulse
+            bodies.moment[pair[0]] = bodies.moment[pair[0]] - total.moment_a
         if bodies.motion_type[pair[1]] == DYNAMIC:
-            bodies.impulse[pair[1]] += total.impulse
-            bodies.moment[pair[1]] += total.moment_b
+            bodies.impulse[pair[1]] = bodies.impulse[pair[1]] + total.impulse
+            bodies.moment[pair[1]] = bodies.moment[pair[1]] + total.moment_b
     warp_sync()
 
 
@@ -253,16 +253,14 @@ def relax_kernel(
         order, color_start: Pairs sorted by color, and where those of each color begin.
         relaxed: Scratch where a warp is one thread, [pair, point].
     """
-    if bodies_inout.is_whole[0] == 0:
-        return
-    backward = relaxation.backward
+    whole, backward = bodies_inout.is_whole[0], relaxation.backward
     colors = relaxation.last_color - relaxation.first_color + 1
     warp = wp.tid() / warp_size()
     for step in range(colors):
         c = relaxation.first_color + point_of_turn(step, colors, backward)
         start, end = color_start[c], color_start[c + 1]
         warps = wp.where(c == COLOR_COUNT, 1, relaxation.warps)
-        if warp < warps:
+        if warp < warps and whole != 0:
             for turn in range(warp, end - start, warps):
                 p = order[wp.where(backward != 0, end - 1 - turn, start + turn)]
                 if relaxation.stage != WARM_START:

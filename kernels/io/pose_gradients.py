@@ -48,15 +48,15 @@ def gradient_adder(real, width: int):
         v = wp.vec3d(u[0], u[1], u[2])
         slope = wp.float64(2.0) * (u[3] * turn + wp.cross(turn, v)) / norm
         for j in range(3):
-            rows[i, 3 + j] += real(slope[j])
-        rows[i, 6] += real(wp.float64(-2.0) * wp.dot(turn, v) / norm)
+            rows[i, 3 + j] = rows[i, 3 + j] + real(slope[j])
+        rows[i, 6] = rows[i, 6] + real(wp.float64(-2.0) * wp.dot(turn, v) / norm)
 
     @wp.func
     def add_matrix(i: wp.int32, poses: wp.array2d(dtype=real), turn: wp.vec3d, rows: wp.array2d(dtype=real)):
         slope = wp.float64(0.5) * wp.skew(turn) * read_rotation(poses, i)
         for j in range(3):
             for k in range(3):
-                rows[i, 4 * j + k] += real(slope[j, k])
+                rows[i, 4 * j + k] = rows[i, 4 * j + k] + real(slope[j, k])
 
     add_turn = add_quaternion if width == 7 else add_matrix
     step = 1 if width == 7 else 4  # from one number of the translation to the next
@@ -73,7 +73,7 @@ def gradient_adder(real, width: int):
         i = wp.tid()
         along, turn = sum_twists(i, pairs, weight, twist)
         for j in range(3):
-            rows_inout[i, first + step * j] += real(along[j])
+            rows_inout[i, first + step * j] = rows_inout[i, first + step * j] + real(along[j])
         add_turn(i, poses, turn, rows_inout)
 
     return add_gradient_kernel
