@@ -9,7 +9,6 @@ from warp_abtree.kernels import native
 
 WARP_SIZE = native.constant("WARP_SIZE")
 RESOLVE_WARPS = native.constant("RESOLVE_WARPS")
-six_numbers = wp.types.vector(length=6, dtype=wp.float64)
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -37,10 +36,6 @@ def value_of_lane(x: wp.int32, lane: wp.int32) -> wp.int32: ...
 
 @native.func_native()
 def vector_of_lane(x: wp.vec3, lane: wp.int32) -> wp.vec3: ...
-
-
-@native.func_native()
-def vector64_of_lane(x: wp.vec3d, lane: wp.int32) -> wp.vec3d: ...
 
 
 @native.func_native()
@@ -87,11 +82,6 @@ def hold_uniform(x: wp.int32) -> wp.int32:
 
 @native.func_native()
 def warp_any(flag: bool) -> bool: ...
-
-
-@native.func_native()
-def add_in_order(sum: six_numbers, x: six_numbers, count: wp.int32) -> six_numbers:
-    """Add the numbers of so many lanes to sums, one lane after the other; on the CPU, of the one thread."""
 
 
 @native.func_native()

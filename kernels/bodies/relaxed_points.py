@@ -6,15 +6,15 @@ Springs and what they give up are those of a substep. Impulses act on both objec
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.lanes import vector64_of_lane
 from warp_abtree.kernels.base.poses import HALF
 from warp_abtree.kernels.base.quotients import divide32, root32
+from warp_abtree.kernels.base.sums import nine_numbers
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, ONE, ZERO, Bodies, radius_of, slop_of
 from warp_abtree.kernels.bodies.constraints import Constraints, velocity_at
 from warp_abtree.kernels.contacts.manifold import Manifolds
 from warp_abtree.kernels.triangle.distance import inverse_power, largest_coordinate, power_below
 
-wp.set_module_options(native.options("base/lanes.cuh", "base/quotients.cuh"))
+wp.set_module_options(native.options("base/lanes.cuh", "base/quotients.cuh", "base/sums.cuh"))
 
 _FREQUENCY = 1.0  # angle that a point's spring would swing by in a substep [rad]
 _RESPONSE = 2.0 * 10.0 + _FREQUENCY  # twice its damping ratio, and that
@@ -99,15 +99,6 @@ class RelaxedPair:
     corrects: wp.bool  # whether points that are too deep are to separate
     struck: wp.int32  # 1 if it has met fast
     settled: wp.float32  # change of speed that is not much
-
-
-@wp.struct
-class PairImpulse:
-    """Sum of impulses of a pair's points."""
-
-    impulse: wp.vec3d  # on the second object; the first has its opposite
-    moment_a: wp.vec3d  # about the centre of mass of the first object
-    moment_b: wp.vec3d  # about that of the second
 
 
 @wp.func
@@ -252,27 +243,17 @@ def relax_point(point: RelaxedPoint, own: RelaxedPair, friction: wp.float32):
 
 @wp.func
 def act_at_point(p: wp.int32, k: wp.int32, half: wp.vec3d, impulse: wp.vec3d, constraints: Constraints):
-    """Return an impulse at the k-th point of a pair with its moments.
+    """Return an impulse at the k-th point of a pair, and its moments about both centres of mass.
 
     Args:
         half: Half of how far the second object has moved more than the first.
     """
-    of_point = PairImpulse()
-    of_point.impulse = impulse
-    of_point.moment_a = wp.cross(constraints.arm_a[p, k] + half, impulse)
-    of_point.moment_b = wp.cross(constraints.arm_b[p, k] - half, impulse)
-    return of_point
+    a = wp.cross(constraints.arm_a[p, k] + half, impulse)
+    b = wp.cross(constraints.arm_b[p, k] - half, impulse)
+    return nine_numbers(impulse[0], impulse[1], impulse[2], a[0], a[1], a[2], b[0], b[1], b[2])
 
 
 @wp.func
-def add_of_lanes(total: PairImpulse, own: PairImpulse, count: wp.int32):
-    """Return a sum with what the first lanes have, in their order."""
-    more = PairImpulse()
-    more.impulse = total.impulse
-    more.moment_a = total.moment_a
-    more.moment_b = total.moment_b
-    for lane in range(count):
-        more.impulse += vector64_of_lane(own.impulse, lane)
-        more.moment_a += vector64_of_lane(own.moment_a, lane)
-        more.moment_b += vector64_of_lane(own.moment_b, lane)
-    return more
+def third_of(numbers: nine_numbers, k: wp.int32):
+    """Return the k-th three of nine numbers: an impulse, or its moment about the first or the second object."""
+    return wp.vec3d(numbers[3 * k], numbers[3 * k + 1], numbers[3 * k + 2])

@@ -24,17 +24,16 @@ from warp_abtree.kernels.base.lanes import (
 )
 from warp_abtree.kernels.base.poses import HALF, PairBatch
 from warp_abtree.kernels.base.quotients import divide32
+from warp_abtree.kernels.base.sums import add_nine_in_order, nine_numbers
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, ZERO, Bodies
 from warp_abtree.kernels.bodies.constraints import Constraints
 from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT
 from warp_abtree.kernels.bodies.relaxed_points import (
-    PairImpulse,
     Relaxation,
     RelaxedPair,
     RelaxedPoint,
     Units,
     act_at_point,
-    add_of_lanes,
     half_shift,
     load_point,
     load_side,
@@ -42,10 +41,14 @@ from warp_abtree.kernels.bodies.relaxed_points import (
     push,
     relax_point,
     response_of,
+    third_of,
 )
 from warp_abtree.kernels.contacts.manifold import Manifolds
 
-wp.set_module_options(native.options("base/lanes.cuh", "base/quotients.cuh"))
+wp.set_module_options(native.options("base/lanes.cuh", "base/quotients.cuh", "base/sums.cuh"))
+
+TAIL_WARPS = native.constant("TAIL_WARPS")
+"""Warps of a block that relaxes several colors."""
 
 WARM_START = wp.constant(0)
 SOLVE = wp.constant(1)
@@ -87,11 +90,12 @@ def visit_points(
     point: wp.ref[RelaxedPoint],
     relaxed: wp.array2d(dtype=RelaxedPoint),
 ):
-    """Relax the points of a pair once, one after the other; return whether any changes much.
+    """Relax the points of a pair once, one after the other; return whether any changes much, and whether any does.
 
     All lanes try their points at once, since most change nothing: the next that does has its turn.
     """
-    backward, lanes, turn, changes = relaxation.backward, warp_size(), wp.int32(0), bool(False)
+    backward, lanes, turn = relaxation.backward, warp_size(), wp.int32(0)
+    much, at_all = bool(False), bool(False)
     while turn < count:
         k = point_of_turn(turn, count, backward)
         if lanes == 1:
@@ -104,12 +108,13 @@ def visit_points(
         acting = lane_in_turn(acts, backward != 0)
         turn += lanes
         if acting >= 0:
+            at_all = bool(True)
             k = wp.where(lanes == 1, k, acting)
             turn = point_of_turn(k, count, backward) + 1
             impulse = more * point.normal + slides
             moment_a, moment_b = wp.cross(point.arm_a, impulse), wp.cross(point.arm_b, impulse)
             if lanes == 1 or resolve_lane() == k:
-                changes = changes or wp.abs(more) > own.settled * point.mass
+                much = much or wp.abs(more) > own.settled * point.mass
                 point.along = along
                 point.across = across
             if lanes == 1:
@@ -117,7 +122,7 @@ def visit_points(
             impulse = vector_of_lane(impulse, k)
             own.change_a = push(own.a, own.change_a, -impulse, -vector_of_lane(moment_a, k))
             own.change_b = push(own.b, own.change_b, impulse, vector_of_lane(moment_b, k))
-    return warp_any(changes)
+    return warp_any(much), at_all
 
 
 @wp.func
@@ -158,8 +163,9 @@ def relax_pair(
     visit, visits = wp.int32(0), most_visits(relaxation.fast, fastest)
     while visit < visits:
         visit += 1
-        changes = visit_points(relaxation, p, count, own, point, relaxed)
-        if visit >= VISITS_LEAST and not changes:
+        much, at_all = visit_points(relaxation, p, count, own, point, relaxed)
+        # What changes nothing once never does.
+        if not at_all or (visit >= VISITS_LEAST and not much):
             visit = visits
     apply_impulses(units, p, pair, point, manifolds, constraints, bodies, relaxed)
     if resolve_lane() == 0:
@@ -184,9 +190,9 @@ def apply_impulses(
     """Write the impulses of a pair's points, and give both objects what is new of them: no momentum is lost."""
     count, unit = manifolds.count[p], units.impulse
     half = half_shift(pair, bodies)
-    total = PairImpulse()
+    total = nine_numbers()
     for first in range(0, count, warp_size()):
-        own, k = PairImpulse(), first + resolve_lane()
+        own, k = nine_numbers(), first + resolve_lane()
         if k < count:
             along, across = wp.float64(point.along) * unit, wp.vec3d(point.across) * unit
             if warp_size() == 1:
@@ -196,14 +202,14 @@ def apply_impulses(
             own = act_at_point(p, k, half, more, constraints)
             constraints.impulse[p, k] = along
             constraints.friction_impulse[p, k] = across
-        total = add_of_lanes(total, own, wp.min(count - first, warp_size()))
+        total = add_nine_in_order(total, own, wp.min(count - first, warp_size()))
     if resolve_lane() == 0:
         if bodies.motion_type[pair[0]] == DYNAMIC:
-            bodies.velocity[pair[0]] = bodies.velocity[pair[0]] - bodies.inverse_mass[pair[0]] * total.impulse
-            bodies.momentum[pair[0]] = bodies.momentum[pair[0]] - total.moment_a
+            bodies.velocity[pair[0]] = bodies.velocity[pair[0]] - bodies.inverse_mass[pair[0]] * third_of(total, 0)
+            bodies.momentum[pair[0]] = bodies.momentum[pair[0]] - third_of(total, 1)
         if bodies.motion_type[pair[1]] == DYNAMIC:
-            bodies.velocity[pair[1]] = bodies.velocity[pair[1]] + bodies.inverse_mass[pair[1]] * total.impulse
-            bodies.momentum[pair[1]] = bodies.momentum[pair[1]] + total.moment_b
+            bodies.velocity[pair[1]] = bodies.velocity[pair[1]] + bodies.inverse_mass[pair[1]] * third_of(total, 0)
+            bodies.momentum[pair[1]] = bodies.momentum[pair[1]] + third_of(total, 2)
 
 
 @wp.func
@@ -214,23 +220,23 @@ def hand_on_impulses(p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constrai
     """
     count, struck = manifolds.count[p], constraints.is_struck[p]
     half = half_shift(pair, bodies)
-    total = PairImpulse()
+    total = nine_numbers()
     for first in range(0, count, warp_size()):
-        own, k = PairImpulse(), first + resolve_lane()
+        own, k = nine_numbers(), first + resolve_lane()
         if k < count:
             if struck != 0:
                 constraints.impulse[p, k] = ZERO
                 constraints.friction_impulse[p, k] = wp.vec3d()
             impulse = constraints.impulse[p, k] * manifolds.normal[p, k] + constraints.friction_impulse[p, k]
             own = act_at_point(p, k, half, impulse, constraints)
-        total = add_of_lanes(total, own, wp.min(count - first, warp_size()))
+        total = add_nine_in_order(total, own, wp.min(count - first, warp_size()))
     if resolve_lane() == 0:
         if bodies.motion_type[pair[0]] == DYNAMIC:
-            bodies.impulse[pair[0]] = bodies.impulse[pair[0]] - total.impulse
-            bodies.moment[pair[0]] = bodies.moment[pair[0]] - total.moment_a
+            bodies.impulse[pair[0]] = bodies.impulse[pair[0]] - third_of(total, 0)
+            bodies.moment[pair[0]] = bodies.moment[pair[0]] - third_of(total, 1)
         if bodies.motion_type[pair[1]] == DYNAMIC:
-            bodies.impulse[pair[1]] = bodies.impulse[pair[1]] + total.impulse
-            bodies.moment[pair[1]] = bodies.moment[pair[1]] + total.moment_b
+            bodies.impulse[pair[1]] = bodies.impulse[pair[1]] + third_of(total, 0)
+            bodies.moment[pair[1]] = bodies.moment[pair[1]] + third_of(total, 2)
     warp_sync()
 
 

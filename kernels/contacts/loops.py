@@ -8,14 +8,15 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import LAST_KEY, Trees
-from warp_abtree.kernels.base.lanes import add_in_order, count_lanes, first_lane, six_numbers, warp_lane, warp_size
+from warp_abtree.kernels.base.lanes import count_lanes, first_lane, warp_lane, warp_size
 from warp_abtree.kernels.base.poses import PairBatch
+from warp_abtree.kernels.base.sums import add_in_order, six_numbers
 from warp_abtree.kernels.contacts.contact import Contacts, pair_direction
 from warp_abtree.kernels.contacts.manifold import Curves
 from warp_abtree.kernels.triangle.distance import largest_coordinate
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
-wp.set_module_options(native.options("base/lanes.cuh", "io/sort_by_pair.h"))
+wp.set_module_options(native.options("base/lanes.cuh", "base/sums.cuh", "io/sort_by_pair.h"))
 
 # Areas of a loop, relative to its length squared, that have no direction worth the name.
 LEAST_LOOP_AREA = wp.constant(wp.float64(2.0**-20))

@@ -10,8 +10,9 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees, no_vector
-from warp_abtree.kernels.base.lanes import add_in_order, six_numbers, warp_lane, warp_size
+from warp_abtree.kernels.base.lanes import warp_lane, warp_size
 from warp_abtree.kernels.base.poses import PairBatch
+from warp_abtree.kernels.base.sums import add_in_order, six_numbers
 from warp_abtree.kernels.contacts.contact import (
     SHORTEST_NORMAL,
     Contacts,
@@ -20,7 +21,7 @@ from warp_abtree.kernels.contacts.contact import (
 )
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
-wp.set_module_options(native.options("base/lanes.cuh", "contacts/contact_sums.h"))
+wp.set_module_options(native.options("base/lanes.cuh", "base/sums.cuh", "contacts/contact_sums.h"))
 
 # Contacts of one object pair that are summed together, in places that its first contact tells.
 CHUNK = native.constant("CHUNK")

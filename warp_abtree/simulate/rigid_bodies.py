@@ -34,7 +34,6 @@ REST_DEPTH, REST_APART = 0.5, 1.0  # at which points rest, in slops: deep, or wi
 CORRECTION = 0.2  # part of the penetration that a step corrects, however deep
 COLOR_ROUNDS = int(COLOR_COUNT)  # of the graph coloring
 LAST_COLORS = 10  # first of the last colors, which one block relaxes
-TAIL_WARPS = 8  # of that block
 RELAXING_WARPS = 8  # of a processor, which relax the pairs of another color
 
 
@@ -284,7 +283,7 @@ class Dynamics(RigidBodies):
             self._relax_colors(each, range(COLOR_COUNT + 1), 1)
             return
         parts: list[tuple] = [([color], self._color_warps) for color in range(LAST_COLORS)]
-        parts.append((range(LAST_COLORS, COLOR_COUNT + 1), TAIL_WARPS))
+        parts.append((range(LAST_COLORS, COLOR_COUNT + 1), solve.TAIL_WARPS))
         for colors, warps in reversed(parts) if each.backward else parts:
             self._relax_colors(each, colors, warps)
 

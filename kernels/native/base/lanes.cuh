@@ -48,33 +48,6 @@ inline CUDA_CALLABLE bool warp_any(bool flag) {
 #endif
 }
 
-inline CUDA_CALLABLE wp::vec_t<6, wp::float64> add_in_order(wp::vec_t<6, wp::float64> sum, wp::vec_t<6, wp::float64> x,
-                                                            wp::int32 count) {
-#if defined(__CUDA_ARCH__)
-    // A column a lane, and one more so that rows begin in banks of their own; then a row a lane.
-    __shared__ double values[6][33];
-    const int lane = threadIdx.x, row = lane < 6 ? lane : 5;
-    double total = sum[0];
-#pragma unroll
-    for (int k = 0; k < 6; ++k) {
-        values[k][lane] = x[k];
-        total = row == k ? sum[k] : total;
-    }
-    __syncwarp();
-    for (int i = 0; i < count; ++i)
-        total += values[row][i];
-    __syncwarp();
-#pragma unroll
-    for (int k = 0; k < 6; ++k)
-        sum[k] = __shfl_sync(0xffffffffu, total, k);
-    return sum;
-#else
-    for (int k = 0; count > 0 && k < 6; ++k)
-        sum[k] += x[k];
-    return sum;
-#endif
-}
-
 inline CUDA_CALLABLE wp::int32 warp_sum(wp::int32 x) {
 #if defined(__CUDA_ARCH__)
     for (int step = 16; step > 0; step >>= 1)
@@ -145,16 +118,13 @@ inline CUDA_CALLABLE wp::int32 value_of_lane(wp::int32 x, wp::int32 lane) {
 #endif
 }
 
-template <class Vector>
-CUDA_CALLABLE Vector vector_of_lane(Vector x, wp::int32 lane) {
+inline CUDA_CALLABLE wp::vec3 vector_of_lane(wp::vec3 x, wp::int32 lane) {
 #if defined(__CUDA_ARCH__)
     for (int k = 0; k < 3; ++k)
         x[k] = __shfl_sync(0xffffffffu, x[k], lane);
 #endif
     return x;
 }
-
-inline CUDA_CALLABLE wp::vec3d vector64_of_lane(wp::vec3d x, wp::int32 lane) { return vector_of_lane(x, lane); }
 
 inline CUDA_CALLABLE wp::uint32 vote_lanes(bool flag) {
 #if defined(__CUDA_ARCH__)
