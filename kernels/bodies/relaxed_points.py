@@ -9,7 +9,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.poses import HALF
 from warp_abtree.kernels.base.quotients import divide32, root32
 from warp_abtree.kernels.base.sums import nine_numbers
-from warp_abtree.kernels.bodies.bodies import DYNAMIC, ONE, ZERO, Bodies, radius_of, slop_of
+from warp_abtree.kernels.bodies.bodies import DYNAMIC, ZERO, Bodies, radius_of, slop_of
 from warp_abtree.kernels.bodies.constraints import Constraints, velocity_at
 from warp_abtree.kernels.contacts.manifold import Manifolds
 from warp_abtree.kernels.triangle.distance import inverse_power, largest_coordinate, power_below
