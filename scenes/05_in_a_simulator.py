@@ -24,6 +24,7 @@ for _ in range(150):
     query.launch()  # both only launch: beside a solver on the device they go into its CUDA graph
     found = query.result()
     found.check()  # raises if there were more contacts
+    pose_input.check()  # and if a pose was none, of an object that then stayed where it was
     room = np.full(len(poses), step)  # in the place of a solver: each ring falls as far as it is apart
     upper = found.pairs[found.contacts["pair"], 1]  # of a pair of rings the second is above
     np.minimum.at(room, upper, np.maximum(found.contacts["separation"], 0))

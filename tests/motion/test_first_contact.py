@@ -215,6 +215,11 @@ def test_sweeps(device, path):
         ({"end_poses": ends, "tolerance": 2}, ValueError, "tolerance"),
     ):
         refused(error, message, ab.sweep, a, b, starts, **{**options, **bad})
+    if not path:
+        apart = np.tile([9.0, 0, 0, 0, 0, 0, 1], (70_000, 1))
+        ends = apart.copy()
+        ends[69_000] = [9, 0, 0, 0, 0, 1, 0]
+        refused(ValueError, "pose 69000 turns by half", ab.sweep, a, b, apart, end_poses=ends, **options)
     assert len(ab.sweep(a, b, np.empty((0, 7)), end_poses=np.empty((0, 7)), **options)) == 0
 
 

@@ -1,5 +1,6 @@
 """Rigid bodies against closed forms and plain Python; prescribed motion, graph coloring and reports of budgets."""
 
+import warnings
 from dataclasses import replace
 from functools import cache
 
@@ -370,3 +371,21 @@ def test_a_budget_below_the_cost_of_the_coarsest_lods_is_impossible():
     assert cost_at_coarsest(at_lods([99, 12, 14, 13, 9], [0, 0, 0, 0, 7])) == 13
     assert cost_at_coarsest(at_lods([99, 12, 14, 9], [0, 0, 5, 7])) is None, "it climbs from there"
     assert cost_at_coarsest(at_lods([99], [0])) is None and cost_at_coarsest([]) is None
+
+
+def test_controllers_warn_of_floors_that_let_bodies_through(device):
+    """A crate of boxes dissolves at its coarsest LOD; with all its faces kept it does not."""
+    walls = [trimesh.creation.box((4, 4, 0.4), trimesh.transformations.translation_matrix((0, 0, -0.2)))]
+    walls += [trimesh.creation.box((0.2, 4, 2), trimesh.transformations.translation_matrix((x, 0, 1))) for x in (-2, 2)]
+    crate, ball = trimesh.util.concatenate(walls), ab.Model.load(trimesh.creation.icosphere(1, 0.3))
+    for faces, warns in ((10, True), (len(crate.faces), False)):
+        scene = ab.Scene(device=device)
+        scene.add(ab.Model.load(crate, base_faces=faces), static=True, name="crate")
+        scene.add(ball, pose=(0, 0, 1, 0, 0, 0, 1))
+        motion = ab.Dynamics(scene).motion()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            ab.Frame(scene, motion, ab.PredictiveController(scene, budget_ms=5.0))
+            ab.Frame(scene, motion)
+        told = [str(warning.message) for warning in caught if "fall through" in str(warning.message)]
+        assert len(told) == warns and all("object 0 'crate'" in text for text in told)

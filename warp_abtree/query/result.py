@@ -184,11 +184,12 @@ class Result(DeviceMemory, Answers):
         for name, what, demand, room in (
             ("pairs", "object pairs of the broad phase", totals.pairs, pairs),
             ("uncertain", "face pairs that need more than float32", totals.uncertain, uncertain),
-            ("hits", "intersecting face pairs", totals.hits, hits),
+            ("hits", "face pairs or witnesses of contact points", totals.hits, hits),
         ):
             if demand > room:
                 raise CapacityError(
-                    f"{demand} {what}, the query has room for {room}: make it with capacity=Buffers({name}={demand})"
+                    f"{demand} {what}, the query has room for {room}: call run(), which makes room, or make it with "
+                    f"capacity=Buffers({name}={demand})"
                 )
 
     def rows(self) -> list[dict[str, Any]]:

@@ -287,7 +287,8 @@ class PosedObjects(DeviceMemory):
             ValueError: No such object, or as `set_poses`; nothing is changed.
         """
         check_device(self.device, "Scene.set_pose (PoseInput can)")
-        i, pose = self._check_object(i), check_poses(to_numpy(pose, "pose")[None], "pose")
+        i = self._check_object(i)
+        pose = check_poses(to_numpy(pose, "pose")[None], "pose", first=i)
         place_row(pose, self.batch().objects.pool, i)
 
     def set_poses(self, poses):

@@ -18,7 +18,7 @@ from warp_abtree.kernels.io.sweep import pose_placer, report_chunk_kernel
 from warp_abtree.query.request import SWEEP_OPTIONS, check_options, check_within, refuse_signed
 from warp_abtree.query.stages.distance import DistanceQuery, check_beyond, check_distance_options
 from warp_abtree.query.stages.intersect import Query
-from warp_abtree.query.stages.motion import FirstContactQuery
+from warp_abtree.query.stages.motion import FirstContactQuery, HalfTurnError
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep_poses import PoseSlot, find_copy_stream, refuse_row, take_rows
 from warp_abtree.state.arrays import ObjectArrays
@@ -212,7 +212,11 @@ class _ChunkQuery:
                 if refused != NONE_REFUSED:
                     refuse_row(rows, start + refused, what)
             self.query.ask_pairs(self.pairs[:count], **distances)
-            yield slice(start, start + count), self.query.run()
+            try:
+                result = self.query.run()
+            except HalfTurnError as error:
+                raise HalfTurnError(start + error.row, f"pose {start + error.row}") from None
+            yield slice(start, start + count), result
 
     def find_faces(self, poses):
         """Return the rows of "faces" of all poses."""

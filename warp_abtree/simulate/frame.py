@@ -132,6 +132,8 @@ class Frame(DeviceMemory):
             raise ValueError(f"lods: a {type(lods).__name__} is neither a controller nor a function of time")
         if not (clock is None or callable(clock)):
             raise ValueError(f"clock: a {type(clock).__name__} cannot be called")
+        if isinstance(lods, Controller) and isinstance(motion, SteppedMotion):
+            motion.warn_of_coarse_lods()
         check_request("faces" if isinstance(output, str) and output == "contacts" else output, "exact")
         self.scene, self.motion, self.lods, self.output = scene, motion, lods, output
         self.time_step = positive(time_step, "time_step")

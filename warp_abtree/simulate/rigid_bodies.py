@@ -6,6 +6,7 @@ relaxation, and motion by semi-implicit Euler with rotations that keep energy; w
 surfaces would meet. docs/dynamics.md has each part, what is conserved and repeated, figures, and limits.
 """
 
+import warnings
 from contextlib import contextmanager
 
 import numpy as np
@@ -308,6 +309,21 @@ class SteppedMotion:
 
     def __len__(self) -> int:
         return len(self.dynamics.mass)
+
+    def warn_of_coarse_lods(self):
+        """Warn of objects that are no bodies and that may let one through at their coarsest LOD."""
+        dynamics, scene = self.dynamics, self.dynamics.scene
+        least = dynamics.bodies.bounding_radius.numpy()[dynamics.rigid].min(initial=np.inf)
+        for i in np.setdiff1d(np.flatnonzero(~dynamics.rigid), scene.batch().removed).tolist():
+            error = scene.models[scene.object_model[i]].error_at(0)
+            if error <= least:
+                continue
+            warnings.warn(
+                f"object {i} {scene.name(i)!r}: at its coarsest LOD its surface is off by up to {error:.3g}, more than "
+                f"the smallest body's radius {least:.3g}: bodies may fall through; make its model with base_faces=",
+                RuntimeWarning,
+                stacklevel=3,
+            )
 
     def warm_up(self, time: float):
         """Load all kernels of a step, and grow to the contacts where the bodies stand; nothing moves."""

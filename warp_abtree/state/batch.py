@@ -230,7 +230,7 @@ def scene_or_batch(scene):
     return scene
 
 
-def check_pairs(pairs, object_count: int, removed=()) -> np.ndarray:
+def check_pairs(pairs, object_count: int, removed=(), owner="the scene", kind="objects") -> np.ndarray:
     """Return object pairs as int32 (p, 2).
 
     Raises ValueError for a wrong shape, an index that is no object or was removed, an object paired with itself.
@@ -243,9 +243,7 @@ def check_pairs(pairs, object_count: int, removed=()) -> np.ndarray:
     # Of the same bits without a sign, a negative number is greater than any index.
     if pairs.astype(np.int64).view(np.uint64).max() >= object_count:
         bad = np.flatnonzero(((pairs < 0) | (pairs >= object_count)).any(1))
-        raise ValueError(
-            f"pairs: pair {bad[0]} is {tuple(pairs[bad[0]].tolist())}, the scene has {object_count} objects"
-        )
+        raise ValueError(f"pairs: pair {bad[0]} is {tuple(pairs[bad[0]].tolist())}, {owner} has {object_count} {kind}")
     same = pairs[:, 0] == pairs[:, 1]
     if same.any():
         first = int(same.argmax())

@@ -39,6 +39,11 @@ def padding_of(robot) -> np.ndarray:
     return np.array([float(given.get(robot.link_names[k], 0.0)) for k in robot.model_link])
 
 
+def tested_pairs(robot) -> np.ndarray:
+    """Return the pairs of models that a robot tests against one another, checked."""
+    return check_pairs(robot.pairs, len(robot.models), owner="the robot", kind="models")
+
+
 def order_parts(robot, meets, padding) -> tuple[link_pairs.Parts, list[tuple[int, int]]]:
     """Return parts with the entries of what is asked, those of the outermost first, and the stages of entries.
 
@@ -47,7 +52,7 @@ def order_parts(robot, meets, padding) -> tuple[link_pairs.Parts, list[tuple[int
     description, models = robot.description, robot.models
     frame = [description.links[robot.link_names[k]] for k in robot.model_link]
     paths = [description.path(f) for f in frame]
-    entries, stages, pairs = [], [], check_pairs(robot.pairs, len(frame))
+    entries, stages, pairs = [], [], tested_pairs(robot)
     mounted = {whole_number(k, "mounted", 0, len(robot.link_names) - 1) for k in robot.mounted}
     for k in sorted(range(len(frame)), key=lambda k: -len(paths[k])):
         first = len(entries)

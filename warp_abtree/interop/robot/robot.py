@@ -22,14 +22,13 @@ from warp_abtree.checks.arguments import (
 from warp_abtree.interop.robot.check import RobotQuery, check_edges
 from warp_abtree.interop.robot.description import Description, RobotError, read_pose
 from warp_abtree.interop.robot.files import read_robot
-from warp_abtree.interop.robot.link_query import padding_of
+from warp_abtree.interop.robot.link_query import padding_of, tested_pairs
 from warp_abtree.interop.robot.surroundings import STILL, make_surroundings
 from warp_abtree.kernels.robot import forward
 from warp_abtree.model.model import Model
 from warp_abtree.query.stages.distance import check_beyond
 from warp_abtree.scene.objects import check_models, check_object_names
 from warp_abtree.scene.scene import Scene
-from warp_abtree.state.batch import check_pairs
 
 # Configurations of a launch: fewer where few are given.
 ROOMS = {"cpu": (16, 256, 4096), "cuda": (1024, 8192, 65536)}
@@ -48,7 +47,7 @@ class Robot:
         attached: Names of those of them that are attached models.
         models: `Model` of each part: the mesh of a link, in the link's frame.
         model_link: Index into `link_names` of each model, int (m,).
-        pairs: Pairs of models that are tested against one another, int (p, 2).
+        pairs: Pairs of indices into `models` that are tested against one another, int (p, 2).
         mounted: Indices into `link_names` of the links that are not tested against what surrounds the robot.
         link_padding: Distances [world units] that are added to the shapes of links in `check` and `check_edges`, a dict
             by name, none at first: links meet within the sum of both, a link and an object of the world within its own.
@@ -174,7 +173,7 @@ class Robot:
         """Test models no more that intersect at a configuration, (n,), as neighbours may. Waits for the device."""
         scene = Scene(self.device)
         self.add_to(scene, configuration)
-        pairs = check_pairs(self.pairs, len(self.models))
+        pairs = tested_pairs(self)
         self.pairs = pairs[~scene.intersect(pairs).any]
 
     def attach(self, model: Model, link: str, pose=STILL, name: str | None = None, touches=()):
@@ -197,7 +196,7 @@ class Robot:
         if name in self.link_names:
             raise ValueError(f"attach: the robot has a link {name!r} already")
         self._find_links([link], "attach")
-        touched, pairs = self._find_links(touches, "touches"), check_pairs(self.pairs, len(self.models))
+        touched, pairs = self._find_links(touches, "touches"), tested_pairs(self)
         description = self.description.with_model(name, model, link, read_pose(pose, "pose"))
         body = description.bodies()[list(description.links.values())]
         tested = np.flatnonzero((body[self.model_link] != body[-1]) & ~np.isin(self.model_link, touched))
@@ -207,7 +206,7 @@ class Robot:
 
     def detach(self, name: str):
         """Take an attached model away; raise ValueError if there is none, or others are attached to it."""
-        description, pairs = self.description.without_model(name), check_pairs(self.pairs, len(self.models))
+        description, pairs = self.description.without_model(name), tested_pairs(self)
         link = self.link_names.index(name)
         k = self.model_link.tolist().index(link)
         self.mounted = [other - (other > link) for other in self.mounted if other != link]
@@ -229,7 +228,7 @@ class Robot:
         poses = self.forward(configuration)
         if poses.ndim != 1:
             raise ValueError(f"add_to: {len(poses)} configurations, not one of shape ({len(self.joint_names)},)")
-        pairs, names = check_pairs(self.pairs, len(self.models)), [self.link_names[k] for k in self.model_link]
+        pairs, names = tested_pairs(self), [self.link_names[k] for k in self.model_link]
         added = scene.add_many(self.models, poses.numpy()[self.model_link], names=names)
         tested = np.eye(len(added), dtype=bool)
         tested[tuple(pairs.T)] = tested[tuple(pairs.T[::-1])] = True
@@ -377,7 +376,7 @@ class Robot:
     def _find_query(self, world, output, count) -> RobotQuery:
         """Return a query of a room for a number of configurations: the one of before if it is of the same."""
         around, key = make_surroundings(world, self.device)
-        key = (*key, check_pairs(self.pairs, len(self.models)).tobytes(), tuple(self.mounted))
+        key = (*key, tested_pairs(self).tobytes(), tuple(self.mounted))
         key += (padding_of(self).tobytes(),)
         rooms = ROOMS["cpu" if self.device.is_cpu else "cuda"]
         room = next((room for room in rooms if room >= count), rooms[-1])

@@ -70,6 +70,20 @@ class SweptBoxes:
         return launch(start.sweep_box_kernel, dim=len(boxes.lower), inputs=inputs, device=operator.device)
 
 
+class HalfTurnError(ValueError):
+    """A motion that turns by half a revolution.
+
+    Attributes:
+        row: Of which pair of a query.
+    """
+
+    def __init__(self, row: int, what: str):
+        super().__init__(
+            f"end_poses: {what} turns by half a revolution, which has no shortest way; split its motion in two"
+        )
+        self.row = row
+
+
 class FirstContactStage(Stage):
     """Find when the pairs first touch that do not intersect at first.
 
@@ -159,8 +173,7 @@ class FirstContactStage(Stage):
         half = np.flatnonzero(ends == int(start.HALF_TURN))
         if len(half):
             pair = (found.pairs.numpy() if device else found.pairs)[half[0]].tolist()
-            why = "turns by half a revolution, which has no shortest way; split its motion in two"
-            raise ValueError(f"end_poses: one of objects {pair} {why}")
+            raise HalfTurnError(int(half[0]), f"one of objects {pair}")
         time = wp.clone(first_rows(self.contacts.time, n))
         found.time = time if device else time.numpy()
         for name, end in (("clear", face_pair.CLEAR), ("undecided", face_pair.UNDECIDED)):
