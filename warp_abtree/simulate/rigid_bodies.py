@@ -33,6 +33,7 @@ SUBSTEPS_LEAST, SUBSTEPS_MAX = 8, 32  # of a step
 GIVE = 0.25  # slops that springs may give for each body borne, unless that takes more substeps
 REST_DEPTH, REST_APART = 0.5, 1.0  # at which points rest, in slops: deep, or with `continuous` apart, within reach
 CORRECTION = 0.2  # part of the penetration that a step corrects, however deep
+FRICTION_MAX = 2.0**60  # beyond which float32 might have no product; nothing slides far below
 COLOR_ROUNDS = int(COLOR_COUNT)  # of the graph coloring
 LAST_COLORS = 10  # first of the last colors, which one block relaxes
 RELAXING_WARPS = 8  # of a processor, which relax the pairs of another color
@@ -200,7 +201,7 @@ class Dynamics(RigidBodies):
         h = dt / substeps
         posed = [query.pair_batch, self._pool, query.manifolds]
         each = solve.Relaxation()
-        each.friction, each.fast = self.friction, 2.0 * float(np.linalg.norm(self.gravity)) * dt
+        each.friction, each.fast = min(self.friction, FRICTION_MAX), 2.0 * float(np.linalg.norm(self.gravity)) * dt
         each.rest = REST_DEPTH if self.certified is None else -REST_APART
         each.per_substep, each.correction = 1.0 / h, CORRECTION / dt
         with self._changing():
