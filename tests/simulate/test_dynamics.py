@@ -380,7 +380,9 @@ def test_controllers_warn_of_floors_that_let_bodies_through(device):
     crate, ball = trimesh.util.concatenate(walls), ab.Model.load(trimesh.creation.icosphere(1, 0.3))
     for faces, warns in ((10, True), (len(crate.faces), False)):
         scene = ab.Scene(device=device)
-        scene.add(ab.Model.load(crate, base_faces=faces), static=True, name="crate")
+        model = ab.Model.load(crate, base_faces=faces)
+        for world in range(3):  # one warning a model
+            scene.add(model, static=True, name=("crate", None, None)[world], world=world)
         scene.add(ball, pose=(0, 0, 1, 0, 0, 0, 1))
         motion = ab.Dynamics(scene).motion()
         with warnings.catch_warnings(record=True) as caught:

@@ -315,16 +315,17 @@ class SteppedMotion:
         """Warn of objects that are no bodies and that may let one through at their coarsest LOD."""
         dynamics, scene = self.dynamics, self.dynamics.scene
         least = dynamics.bodies.bounding_radius.numpy()[dynamics.rigid].min(initial=np.inf)
-        for i in np.setdiff1d(np.flatnonzero(~dynamics.rigid), scene.batch().removed).tolist():
-            error = scene.models[scene.object_model[i]].error_at(0)
-            if error <= least:
-                continue
-            warnings.warn(
-                f"object {i} {scene.name(i)!r}: at its coarsest LOD its surface is off by up to {error:.3g}, more than "
-                f"the smallest body's radius {least:.3g}: bodies may fall through; make its model with base_faces=",
-                RuntimeWarning,
-                stacklevel=3,
-            )
+        fixed = np.setdiff1d(np.flatnonzero(~dynamics.rigid), scene.batch().removed).tolist()
+        for model, i in {scene.object_model[i]: i for i in reversed(fixed)}.items():
+            error = scene.models[model].error_at(0)
+            if error > least:
+                warnings.warn(
+                    f"object {i} {scene.name(i)!r}: at its model's coarsest LOD the surface is off by up to "
+                    f"{error:.3g}, more than the smallest body's radius {least:.3g}: bodies may fall through; make the "
+                    "model with base_faces=",
+                    RuntimeWarning,
+                    stacklevel=3,
+                )
 
     def warm_up(self, time: float):
         """Load all kernels of a step, and grow to the contacts where the bodies stand; nothing moves."""

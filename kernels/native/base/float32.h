@@ -62,11 +62,14 @@ struct Float32 {
     };
 
     static lanes every(float v) { return lanes{v, v, v, v, v, v, v, v, v, v, v, v, v, v, v, v}; }
-    static lanes invert(const lanes& v) { return ((v > INVERTED_LEAST) & (v < INVERTED_MOST)) ? 1.0f / v : lanes{}; }
+    template <class Lanes>
+    static Lanes invert(const Lanes& v) {
+        return ((v > INVERTED_LEAST) & (v < INVERTED_MOST)) ? 1.0f / v : Lanes{};
+    }
     static lanes root(const lanes& v) { return __builtin_elementwise_sqrt(v); }
     static float root(float v) { return __builtin_sqrtf(v); }
     static float divide(float a, float b) {
-        const float inverse = first(invert(every(b))), near = a * inverse;
+        const float inverse = invert(b), near = a * inverse;
         return inverse == 0.0f ? 0.0f : fuse(fuse(-b, near, a), inverse, near);
     }
     static float first(const lanes& v) { return v[0]; }
