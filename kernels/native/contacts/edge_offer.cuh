@@ -34,11 +34,11 @@ struct EdgeOffer {
                                               Scores& scores) {
         visit_edges(c, [&](const Point& p, const Point& e, const Point& r, const Point& f) {
             lanes s;
-            const Point v = N::between_edges(r, e, f, N::invert(F::dot(e, e)), N::invert(F::dot(f, f)), s);
+            const Point v = N::between_edges(r, e, f, F::invert(F::dot(e, e)), F::invert(F::dot(f, f)), s);
             const lanes height = F::dot(v, normal), square = height * height;
             const bits over = F::dot(v, v) <= F::fuse(square, lanes{} + (1.0f + 0x1p-6f), slack * slack);
             const bits near = (height <= gap) & (height >= -gap);
-            scores.offer(weight, vector_of(N::add(p, s, e)), N::most(height, distance), counts & over & near);
+            scores.offer(weight, vector_of(N::add(p, s, e)), F::most(height, distance), counts & over & near);
         });
     }
     // Rates the ends of what edges share that are parallel: the nearest points from either end of one.
@@ -46,9 +46,9 @@ struct EdgeOffer {
                                          Scores& scores) {
         visit_edges(c, [&](const Point& p, const Point& e, const Point& r, const Point& f) {
             for (int k = 0; k < 2; ++k) {
-                const lanes t = N::clamp((F::dot(e, f) * (float)k - F::dot(r, f)) * N::invert(F::dot(f, f)));
+                const lanes t = N::clamp((F::dot(e, f) * (float)k - F::dot(r, f)) * F::invert(F::dot(f, f)));
                 const Point way = N::add(r, t, f);
-                const lanes s = N::clamp(F::dot(way, e) * N::invert(F::dot(e, e)));
+                const lanes s = N::clamp(F::dot(way, e) * F::invert(F::dot(e, e)));
                 const Point v = N::add(way, -s, e);
                 const lanes distance = F::root(F::dot(v, v));
                 scores.offer(weight, vector_of(N::add(N::add(p, s, e), lanes{} + 0.5f, v)), distance,

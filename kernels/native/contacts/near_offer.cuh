@@ -35,7 +35,7 @@ struct NearOffer {
 
     static CUDA_CALLABLE Point unit_normal(const Point (&c)[3]) {
         const Point n = N::cross_exactly(F::minus(c[1], c[0]), F::minus(c[2], c[0]));
-        const lanes s = N::invert(F::root(F::dot(n, n)));
+        const lanes s = F::invert(F::root(F::dot(n, n)));
         return Point{n.x * s, n.y * s, n.z * s};
     }
     // What joins two faces: from a point of A to the nearest of B; corners over a face, and how far in front of it.
@@ -68,13 +68,13 @@ struct NearOffer {
     };
     static CUDA_CALLABLE Scores::Vector vector_of(const Point& p) { return {p.x, p.y, p.z}; }
     static CUDA_CALLABLE lanes face_size(const Point (&c)[3]) {
-        return N::most(N::largest(F::minus(c[1], c[0])), N::largest(F::minus(c[2], c[0])));
+        return F::most(N::largest(F::minus(c[1], c[0])), N::largest(F::minus(c[2], c[0])));
     }
     // Whether a face lies in front of a plane, or within a slack of it.
     static CUDA_CALLABLE bits is_ahead(const Point (&c)[3], const Point& of, const Point& normal, const lanes& slack) {
         lanes lowest = F::dot(F::minus(c[0], of), normal);
         for (int k = 1; k < 3; ++k)
-            lowest = N::least(lowest, F::dot(F::minus(c[k], of), normal));
+            lowest = F::least(lowest, F::dot(F::minus(c[k], of), normal));
         return lowest >= -slack;
     }
     static CUDA_CALLABLE Scores rate(const N::Corners& c, float gap, float weight, const float* directions) {
@@ -92,7 +92,7 @@ struct NearOffer {
         const bits facing = product <= LOOKS_AT;
         // Along a normal, or so near that normals tell the direction.
         const lanes least = distance * 0x1p-6f, straight = distance * 0.99f;
-        const lanes most = N::most(F::absolute(ahead_a), F::absolute(ahead_b));
+        const lanes most = F::most(F::absolute(ahead_a), F::absolute(ahead_b));
         const bits touches = distance <= slack, column = facing & (touches | (most >= straight));
         // An edge or a corner that stands over the other face, and not along it.
         const bits tilted = (product < LOOKS_AWAY) & (product > (float)-ALONG),
@@ -127,7 +127,7 @@ struct NearOffer {
         scores.inside = inside;
         scores.counts = counts;
         const bits shared = column & (separation >= 0.0f);
-        const bits large = N::least(face_size(c.a), face_size(c.b)) * weight >= LARGE_FACE * gap;
+        const bits large = F::least(face_size(c.a), face_size(c.b)) * weight >= LARGE_FACE * gap;
         const bits of_a = shared | (over_b & large), of_b = shared | (over_a & large);
         // What touches beside a column, perhaps looking away, goes behind all that is in one.
         const lanes rank = touches & ((column | over_a | over_b) == 0) ? separation + gap : separation;

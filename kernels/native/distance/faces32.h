@@ -11,10 +11,7 @@ struct NearestFaces {
     struct Corners {
         Point a[3], b[3];
     };
-    static CUDA_CALLABLE lanes most(const lanes& a, const lanes& b) { return F::most(a, b); }
-    static CUDA_CALLABLE lanes least(const lanes& a, const lanes& b) { return F::least(a, b); }
-    static CUDA_CALLABLE lanes clamp(const lanes& x) { return least(most(x, lanes{}), lanes{} + 1.0f); }
-    static CUDA_CALLABLE lanes invert(const lanes& x) { return F::invert(x); }
+    static CUDA_CALLABLE lanes clamp(const lanes& x) { return F::least(F::most(x, lanes{}), lanes{} + 1.0f); }
     static CUDA_CALLABLE Point add(const Point& p, const lanes& s, const Point& v) {
         return Point{F::fuse(s, v.x, p.x), F::fuse(s, v.y, p.y), F::fuse(s, v.z, p.z)};
     }
@@ -33,7 +30,7 @@ struct NearestFaces {
     static CUDA_CALLABLE Point between_edges(const Point& r, const Point& e, const Point& f, const lanes& inverse_e,
                                              const lanes& inverse_f, lanes& s) {
         const Point n = F::cross(e, f);
-        s = clamp(F::dot(F::cross(r, f), n) * invert(F::dot(n, n)));
+        s = clamp(F::dot(F::cross(r, f), n) * F::invert(F::dot(n, n)));
         const lanes t = clamp((F::dot(e, f) * s - F::dot(r, f)) * inverse_f);
         s = clamp(F::dot(add(r, t, f), e) * inverse_e);
         return add(add(r, t, f), -s, e);
@@ -56,28 +53,28 @@ struct NearestFaces {
         const Point f[3] = {F::minus(c.b[1], c.b[0]), F::minus(c.b[2], c.b[1]), F::minus(c.b[0], c.b[2])};
         lanes inverse_e[3], inverse_f[3], size = {}, s;
         for (int k = 0; k < 3; ++k) {
-            inverse_e[k] = invert(F::dot(e[k], e[k]));
-            inverse_f[k] = invert(F::dot(f[k], f[k]));
+            inverse_e[k] = F::invert(F::dot(e[k], e[k]));
+            inverse_f[k] = F::invert(F::dot(f[k], f[k]));
         }
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j) {
                 const Point r = F::minus(c.b[j], c.a[i]);
-                size = most(size, largest(r));
+                size = F::most(size, largest(r));
                 const Point v = between_edges(r, e[i], f[j], inverse_e[i], inverse_f[j], s);
                 keeper.offer_edges(v, c.a[i], s, e[i]);
             }
         const Point back_a = F::minus(c.a[2], c.a[0]), back_b = F::minus(c.b[2], c.b[0]);
         const Point n = cross_exactly(e[0], back_a), m = cross_exactly(f[0], back_b);
-        const lanes inverse_n = invert(F::dot(n, n)), inverse_m = invert(F::dot(m, m));
+        const lanes inverse_n = F::invert(F::dot(n, n)), inverse_m = F::invert(F::dot(m, m));
         for (int k = 0; k < 3; ++k) {
             keeper.offer_corner_of_b(over_face(F::minus(c.b[k], c.a[0]), e[0], back_a, n, inverse_n), c.b[k]);
             keeper.offer_corner_of_a(over_face(F::minus(c.a[k], c.b[0]), f[0], back_b, m, inverse_m), c.a[k]);
         }
-        return most(most(size, largest(e[0])), most(largest(back_a), most(largest(f[0]), largest(back_b))));
+        return F::most(F::most(size, largest(e[0])), F::most(largest(back_a), F::most(largest(f[0]), largest(back_b))));
     }
     struct Nearest {
         lanes square;
-        CUDA_CALLABLE void offer(const Point& v) { square = least(square, F::dot(v, v)); }
+        CUDA_CALLABLE void offer(const Point& v) { square = F::least(square, F::dot(v, v)); }
         CUDA_CALLABLE void offer_edges(const Point& v, const Point&, const lanes&, const Point&) { offer(v); }
         CUDA_CALLABLE void offer_corner_of_b(const Point& v, const Point&) { offer(v); }
         CUDA_CALLABLE void offer_corner_of_a(const Point& v, const Point&) { offer(v); }
