@@ -23,6 +23,24 @@ def take_slots(total: wp.array(dtype=wp.int32), count: wp.int32) -> wp.int32:
 
 
 @native.func_native()
+def take_turn(taken: wp.array(dtype=wp.int32), i: wp.int32) -> wp.int32:
+    """Return to a warp how many have called this with an i before; those have begun, so it may wait for them."""
+
+
+@native.func_native()
+def wait_for_counts(counts: wp.array(dtype=wp.int32), ids: wp.vec2i, values: wp.vec2i):
+    """Wait until two counts have at least their values, and see what was written before these were published.
+
+    On the CPU one thread takes all turns, so nothing is to be waited for.
+    """
+
+
+@native.func_native()
+def publish_counts(counts: wp.array(dtype=wp.int32), ids: wp.vec2i, values: wp.vec2i):
+    """Set two counts, but to no value below 1, after all that the warp has written."""
+
+
+@native.func_native()
 def add_warp_sum(totals: wp.array(dtype=wp.int64), i: wp.int32, x: wp.int32):
     """Add a value of every lane to totals[i] with one atomic a warp."""
 

@@ -20,4 +20,4 @@ def add_in_order(sum: six_numbers, x: six_numbers, count: wp.int32) -> six_numbe
 
 @native.func_native()
 def add_nine_in_order(sum: nine_numbers, x: nine_numbers, count: wp.int32) -> nine_numbers:
-    """Add the numbers of so many lanes to sums, in blocks of TAIL_WARPS at most."""
+    """As `add_in_order`."""

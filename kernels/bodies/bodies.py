@@ -61,6 +61,8 @@ class Bodies:
     corrects: wp.array(dtype=wp.int32)  # whether a pair of it takes deep points apart, 0 or 1
     bid: wp.array(dtype=wp.int64)  # highest bid of the graph coloring
     colors: wp.array(dtype=wp.int32)  # bit mask of the colors that its pairs have
+    uncolored: wp.array(dtype=wp.int32)  # how many of its pairs have none of their own
+    relaxed: wp.array(dtype=wp.int32)  # how often its pairs have been relaxed
     is_whole: wp.array(dtype=wp.int32)  # entry 0: whether all contacts are known, 0 or 1; else bodies keep their state
 
 
@@ -130,6 +132,8 @@ def begin_step_kernel(dt: wp.float64, targets: ObjectPool, objects: ObjectPool, 
     bodies_inout.bid[i] = wp.int64(0)
     bodies_inout.corrects[i] = 0
     bodies_inout.colors[i] = 0
+    bodies_inout.uncolored[i] = 0
+    bodies_inout.relaxed[i] = 0
     if bodies_inout.motion_type[i] == DYNAMIC:
         bodies_inout.inverse_inertia[i] = world_inertia(bodies_inout.rotation[i], bodies_inout.inverse_moment[i])
         return

@@ -24,6 +24,7 @@ class Constraints:
     friction_impulse: wp.array2d(dtype=wp.vec3d)  # of a substep, across the normal, world frame
     is_struck: wp.array(dtype=wp.int32)  # [pair] whether it met fast: the next substep has none of its impulses
     color: wp.array(dtype=wp.int32)  # [pair] 0 .. COLOR_COUNT, or INACTIVE
+    rank: wp.array(dtype=wp.vec2i)  # [pair] how many pairs are relaxed before it that have its bodies
 
 
 @wp.struct

@@ -7,7 +7,7 @@ Source: Luby 1986; Jones and Plassmann 1993.
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.lanes import lowest_bit
+from warp_abtree.kernels.base.lanes import count_bits, lowest_bit
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, Bodies
 
@@ -76,20 +76,50 @@ def assign_color_kernel(
             bodies_inout.colors[i] = bodies_inout.colors[i] | (1 << color)
 
 
+@wp.func
+def rank_among(i: wp.int32, color: wp.int32, bodies: Bodies):
+    """Return how many pairs of a body have lower colors."""
+    return count_bits(bodies.colors[i] & ((1 << color) - 1))
+
+
+@wp.func
+def count_uncolored(i: wp.int32, bodies: Bodies):
+    """Count a pair without a color of its own to a body; return its rank among the body's pairs."""
+    rank = rank_among(i, COLOR_COUNT, bodies) + bodies.uncolored[i]
+    bodies.uncolored[i] = bodies.uncolored[i] + 1
+    return rank
+
+
 @wp.kernel
-def find_color_kernel(color: wp.array(dtype=wp.int32), start_out: wp.array(dtype=wp.int32)):
-    """Find where the pairs of each color begin among pairs sorted by color, and where the last of them ends.
+def rank_pairs_kernel(
+    color: wp.array(dtype=wp.int32),
+    order: wp.array(dtype=wp.int32),
+    batch: PairBatch,
+    bodies_inout: Bodies,
+    rank_out: wp.array(dtype=wp.vec2i),
+    count_out: wp.array(dtype=wp.int32),
+):
+    """Rank pairs among those of their bodies, in the order of colors; one thread ranks those without one.
 
     Args:
         color: In ascending order, shape [2 pair]; its second half is scratch.
+        order: Pairs in this order.
+        count_out: Entry 0: number of pairs in contact, 0 before.
     """
-    i = wp.tid()
-    room = color.shape[0] // 2
-    last = COLOR_COUNT + 1
-    before, here = wp.int32(-1), wp.int32(last)
-    if i > 0:
-        before = wp.min(color[i - 1], last)
-    if i < room:
-        here = wp.min(color[i], last)
-    for c in range(before + 1, here + 1):
-        start_out[c] = i
+    i, room = wp.tid(), color.shape[0] // 2
+    if color[i] > COLOR_COUNT:
+        return
+    if i + 1 == room or color[wp.min(i + 1, room - 1)] > COLOR_COUNT:
+        count_out[0] = i + 1
+    if color[i] < COLOR_COUNT:
+        pair = batch.pairs[order[i]]
+        rank_out[order[i]] = wp.vec2i(
+            rank_among(pair[0], color[i], bodies_inout), rank_among(pair[1], color[i], bodies_inout)
+        )
+    elif i == 0 or color[wp.max(i - 1, 0)] < COLOR_COUNT:
+        k = wp.int32(i)
+        while k < room and color[wp.min(k, room - 1)] == COLOR_COUNT:
+            pair = batch.pairs[order[k]]
+            rank_a = count_uncolored(pair[0], bodies_inout)
+            rank_out[order[k]] = wp.vec2i(rank_a, count_uncolored(pair[1], bodies_inout))
+            k += 1

@@ -34,9 +34,7 @@ class Relaxation:
 
     stage: wp.int32  # WARM_START, SOLVE or RELAX
     backward: wp.int32  # 1 if it goes from the last pair to the first
-    first_color: wp.int32  # first color of the range
-    last_color: wp.int32  # last color of the range
-    warps: wp.int32  # warps of the launch; one block where there are several colors
+    passes: wp.int32  # passes of this step before it
     friction: wp.float64  # coefficient of Coulomb's law
     fast: wp.float64  # speed from which on points that meet strike [world units/s]; 0 without gravity
     rest: wp.float64  # depth at which points rest, in slops
@@ -78,10 +76,11 @@ class RelaxedPoint:
     normal: wp.vec3  # from the first object to the second
     arm_a: wp.vec3  # from the centre of mass of the first object to where its impulses act
     arm_b: wp.vec3  # from that of the second
+    may: wp.float64  # speed at which it may approach [world units/s], below 0 if it is to separate
     velocity: wp.vec3  # of the second object relative to the first where a pass begins
     response: wp.vec3  # velocity that a unit impulse along the normal gives
     mass: wp.float32  # impulse along the normal that a unit of speed along it takes
-    approach: wp.float32  # speed at which it may approach, below 0 if it is to separate
+    approach: wp.float32  # `may` in the pair's units
     along: wp.float32  # impulse along the normal
     across: wp.vec3  # across it, world frame
     is_deep: wp.bool  # deeper than it rests
@@ -109,17 +108,20 @@ def dynamic_part(bodies: Bodies, i: wp.int32):
 
 
 @wp.func
-def make_units(per_substep: wp.float64, pair: wp.vec2i, bodies: Bodies):
+def make_units(pair: wp.vec2i, bodies: Bodies):
+    """Return the units of a pair, without those of speed and of impulses."""
     units = Units()
     units.length = power_below(radius_of(bodies, pair))
     units.per_length = inverse_power(units.length)
-    fastest = largest_coordinate(bodies.velocity[pair[1]] - bodies.velocity[pair[0]])
-    speed = power_below(wp.max(slop_of(bodies, pair) * per_substep, fastest))
-    units.per_speed = inverse_power(speed)
     lightness = dynamic_part(bodies, pair[0]) + dynamic_part(bodies, pair[1])
     units.mass = HALF * inverse_power(power_below(lightness))
-    units.impulse = units.mass * speed
     return units
+
+
+@wp.func
+def speed_unit(per_substep: wp.float64, pair: wp.vec2i, bodies: Bodies):
+    fastest = largest_coordinate(bodies.velocity[pair[1]] - bodies.velocity[pair[0]])
+    return power_below(wp.max(slop_of(bodies, pair) * per_substep, fastest))
 
 
 @wp.func
@@ -191,10 +193,10 @@ def half_shift(pair: wp.vec2i, bodies: Bodies):
 
 
 @wp.func
-def load_point(
+def place_point(
     relaxation: Relaxation,
     units: Units,
-    corrects: bool,
+    own: RelaxedPair,
     p: wp.int32,
     k: wp.int32,
     pair: wp.vec2i,
@@ -202,29 +204,51 @@ def load_point(
     constraints: Constraints,
     bodies: Bodies,
 ):
-    """Return the k-th point of a pair, without its responses, and at what speed it approaches [world units/s].
+    """Return the k-th point of a pair without what depends on speeds.
 
     Its impulses act in the middle of where both objects have taken it.
     """
     a, b, slop = pair[0], pair[1], slop_of(bodies, pair)
     n, first_a, first_b = manifolds.normal[p, k], constraints.arm_a[p, k], constraints.arm_b[p, k]
-    shift = bodies.moved[b] - bodies.moved[a]
     half = half_shift(pair, bodies)
-    arm_a, arm_b = first_a + half, first_b - half
-    moved = shift + wp.cross(bodies.turned[b], first_b) - wp.cross(bodies.turned[a], first_a)
+    moved = bodies.moved[b] - bodies.moved[a]
+    moved += wp.cross(bodies.turned[b], first_b) - wp.cross(bodies.turned[a], first_a)
     room = relaxation.rest * slop - manifolds.depth[p, k] + wp.dot(n, moved)
-    velocity = velocity_at(bodies, b, arm_b) - velocity_at(bodies, a, arm_a)
-    point, per_impulse = RelaxedPoint(), inverse_power(units.impulse)
+    point = RelaxedPoint()
     point.normal = wp.vec3(n)
-    point.arm_a = wp.vec3(arm_a * units.per_length)
-    point.arm_b = wp.vec3(arm_b * units.per_length)
-    point.velocity = wp.vec3(velocity * units.per_speed)
-    point.approach = wp.float32(approach_of(relaxation, corrects, slop, room) * units.per_speed)
-    point.along = wp.float32(constraints.impulse[p, k] * per_impulse)
-    point.across = wp.vec3(constraints.friction_impulse[p, k] * per_impulse)
+    point.arm_a = wp.vec3((first_a + half) * units.per_length)
+    point.arm_b = wp.vec3((first_b - half) * units.per_length)
+    point.response = response_of(own.a, point.arm_a, point.normal) + response_of(own.b, point.arm_b, point.normal)
+    point.mass = divide32(1.0, wp.dot(point.normal, point.response))
+    point.may = approach_of(relaxation, own.corrects, slop, room)
     point.is_deep = room < ZERO
     point.is_apart = room > slop
-    return point, -wp.dot(n, velocity)
+    return point
+
+
+@wp.func
+def start_point(
+    point: wp.ref[RelaxedPoint],
+    units: Units,
+    p: wp.int32,
+    k: wp.int32,
+    pair: wp.vec2i,
+    manifolds: Manifolds,
+    constraints: Constraints,
+    bodies: Bodies,
+):
+    """Give a placed point the speeds and impulses that a pass begins with; return how fast it approaches.
+
+    That is in world units/s.
+    """
+    half, per_impulse = half_shift(pair, bodies), inverse_power(units.impulse)
+    velocity = velocity_at(bodies, pair[1], constraints.arm_b[p, k] - half)
+    velocity -= velocity_at(bodies, pair[0], constraints.arm_a[p, k] + half)
+    point.velocity = wp.vec3(velocity * units.per_speed)
+    point.approach = wp.float32(point.may * units.per_speed)
+    point.along = wp.float32(constraints.impulse[p, k] * per_impulse)
+    point.across = wp.vec3(constraints.friction_impulse[p, k] * per_impulse)
+    return -wp.dot(manifolds.normal[p, k], velocity)
 
 
 @wp.func

@@ -1,4 +1,4 @@
-"""Relaxation of contact constraints: projected Gauss-Seidel (sequential impulses), one color of pairs after another.
+"""Relaxation of contact constraints: projected Gauss-Seidel (sequential impulses), the pairs in order of their color.
 
 A step has substeps, each of which begins with the impulses of the one before, solves for velocities that also take
 penetrating points apart, relaxes: removes that from the velocities again, and moves the bodies by both. What moves and
@@ -6,14 +6,17 @@ relaxes at one place adds no energy.
 Points that penetrate are springs, stiff for the length of a substep, so that a stack finds its balance.
 Source: Macklin et al. 2019, Small Steps in Physics Simulation; Catto 2024, Solver2D ("soft step").
 
-Pairs of one color share no dynamic body, so one thread for all of them and a thread for each give the same bits.
+A pair waits for those before it in that order that have one of its bodies, and for no other: one warp for all pairs and
+a warp for each give the same bits. Warps take turns in this order, so that what they wait for has begun.
 """
 
 import warp as wp
 
 from warp_abtree.kernels import native
+from warp_abtree.kernels.base.counters import publish_counts, take_turn, wait_for_counts
 from warp_abtree.kernels.base.lanes import (
-    block_sync,
+    WARP_SIZE,
+    count_bits,
     lane_in_turn,
     resolve_lane,
     vector_of_lane,
@@ -23,11 +26,9 @@ from warp_abtree.kernels.base.lanes import (
     warp_sync,
 )
 from warp_abtree.kernels.base.poses import HALF, PairBatch
-from warp_abtree.kernels.base.quotients import divide32
 from warp_abtree.kernels.base.sums import add_nine_in_order, nine_numbers
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, ZERO, Bodies
 from warp_abtree.kernels.bodies.constraints import Constraints
-from warp_abtree.kernels.bodies.graph_coloring import COLOR_COUNT
 from warp_abtree.kernels.bodies.relaxed_points import (
     Relaxation,
     RelaxedPair,
@@ -35,20 +36,22 @@ from warp_abtree.kernels.bodies.relaxed_points import (
     Units,
     act_at_point,
     half_shift,
-    load_point,
     load_side,
     make_units,
+    place_point,
     push,
     relax_point,
-    response_of,
+    speed_unit,
+    start_point,
     third_of,
 )
 from warp_abtree.kernels.contacts.manifold import Manifolds
+from warp_abtree.kernels.triangle.distance import inverse_power
 
-wp.set_module_options(native.options("base/lanes.cuh", "base/quotients.cuh", "base/sums.cuh"))
-
-TAIL_WARPS = native.constant("TAIL_WARPS")
-"""Warps of a block that relaxes several colors."""
+wp.set_module_options(
+    native.options("base/counters.cuh", "base/lanes.cuh", "base/quotients.cuh", "base/sums.cuh")
+    | {"block_dim": WARP_SIZE}
+)
 
 WARM_START = wp.constant(0)
 SOLVE = wp.constant(1)
@@ -126,10 +129,22 @@ def visit_points(
 
 
 @wp.func
+def count_turns(relaxation: Relaxation, i: wp.int32, rank: wp.int32, bodies: Bodies):
+    """Return how often pairs have been relaxed in this step that have an object, before that of a rank among them.
+
+    -1 if nothing changes its motion.
+    """
+    pairs = count_bits(bodies.colors[i]) + bodies.uncolored[i]
+    before = relaxation.passes * pairs + point_of_turn(rank, pairs, relaxation.backward)
+    return wp.where(bodies.motion_type[i] == DYNAMIC, before, -1)
+
+
+@wp.func
 def relax_pair(
     relaxation: Relaxation,
     p: wp.int32,
     pair: wp.vec2i,
+    turns: wp.vec2i,
     manifolds: Manifolds,
     constraints: Constraints,
     bodies: Bodies,
@@ -138,27 +153,34 @@ def relax_pair(
     """Relax the points of a pair: the normal velocity, then the tangential one within the friction cone.
 
     The points are relaxed several times, one after the other; a warp's lanes hold one each. A pair is struck if it
-    meets fast where a pass begins.
+    meets fast where a pass begins. What depends on no speed is done before it waits for its turns.
     """
     stage, count, lanes, own = relaxation.stage, manifolds.count[p], warp_size(), RelaxedPair()
-    units = make_units(relaxation.per_substep, pair, bodies)
+    units = make_units(pair, bodies)
     own.a = load_side(units, bodies, pair[0])
     own.b = load_side(units, bodies, pair[1])
     # Without gravity two rigid bodies are not pushed apart, which would add energy.
     one_moves = not (own.a.inverse_mass > 0.0 and own.b.inverse_mass > 0.0)
     own.corrects = stage == SOLVE and (relaxation.fast > ZERO or one_moves)
+    own.struck = wp.where(stage == RELAX, constraints.is_struck[p], 0)
     point = RelaxedPoint()
+    for k in range(resolve_lane(), count, lanes):
+        point = place_point(relaxation, units, own, p, k, pair, manifolds, constraints, bodies)
+        if lanes == 1:
+            relaxed[p, k] = point
+    wait_for_counts(bodies.relaxed, pair, turns)
+    speed = speed_unit(relaxation.per_substep, pair, bodies)
+    units.per_speed = inverse_power(speed)
+    units.impulse = units.mass * speed
     fastest = wp.float64(0.0)
     for k in range(resolve_lane(), count, lanes):
-        point, speed = load_point(relaxation, units, own.corrects, p, k, pair, manifolds, constraints, bodies)
-        point.response = response_of(own.a, point.arm_a, point.normal) + response_of(own.b, point.arm_b, point.normal)
-        point.mass = divide32(1.0, wp.dot(point.normal, point.response))
-        fastest = wp.max(fastest, speed)
+        if lanes == 1:
+            point = relaxed[p, k]
+        fastest = wp.max(fastest, start_point(point, units, p, k, pair, manifolds, constraints, bodies))
         if lanes == 1:
             relaxed[p, k] = point
     fastest = warp_max(fastest)
     own.settled = wp.float32(SETTLED * relaxation.fast * units.per_speed)
-    own.struck = wp.where(stage == RELAX, constraints.is_struck[p], 0)
     own.struck = wp.where(fastest > relaxation.fast, 1, own.struck)
     visit, visits = wp.int32(0), most_visits(relaxation.fast, fastest)
     while visit < visits:
@@ -244,34 +266,33 @@ def hand_on_impulses(p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constrai
 def relax_kernel(
     relaxation: Relaxation,
     order: wp.array(dtype=wp.int32),
-    color_start: wp.array(dtype=wp.int32),
     batch: PairBatch,
     manifolds: Manifolds,
     relaxed: wp.array2d(dtype=RelaxedPoint),
+    turns_inout: wp.array(dtype=wp.int32),
     constraints_inout: Constraints,
     bodies_inout: Bodies,
 ):
-    """Relax the pairs of a range of colors, color by color; the warps of the launch share those of a color.
-
-    One warp relaxes the pairs without a color of their own.
+    """Relax the pairs in contact, each by a warp.
 
     Args:
-        order, color_start: Pairs sorted by color, and where those of each color begin.
+        order: Pairs sorted by color.
         relaxed: Scratch where a warp is one thread, [pair, point].
+        turns_inout: How many pairs are in contact; then of each pass how many turns are taken.
     """
-    whole, backward = bodies_inout.is_whole[0], relaxation.backward
-    colors = relaxation.last_color - relaxation.first_color + 1
-    warp = wp.tid() / warp_size()
-    for step in range(colors):
-        c = relaxation.first_color + point_of_turn(step, colors, backward)
-        start, end = color_start[c], color_start[c + 1]
-        warps = wp.where(c == COLOR_COUNT, 1, relaxation.warps)
-        if warp < warps and whole != 0:
-            for turn in range(warp, end - start, warps):
-                p = order[wp.where(backward != 0, end - 1 - turn, start + turn)]
-                if relaxation.stage != WARM_START:
-                    relax_pair(relaxation, p, batch.pairs[p], manifolds, constraints_inout, bodies_inout, relaxed)
-                if relaxation.stage != SOLVE:
-                    hand_on_impulses(p, batch.pairs[p], manifolds, constraints_inout, bodies_inout)
-        if colors > 1:
-            block_sync()
+    end = wp.where(bodies_inout.is_whole[0] != 0, turns_inout[0], 0)
+    turn = take_turn(turns_inout, relaxation.passes + 1)
+    while turn < end:
+        p = order[point_of_turn(turn, end, relaxation.backward)]
+        pair, rank = batch.pairs[p], constraints_inout.rank[p]
+        before_a = count_turns(relaxation, pair[0], rank[0], bodies_inout)
+        before_b = count_turns(relaxation, pair[1], rank[1], bodies_inout)
+        before = wp.vec2i(before_a, before_b)
+        if relaxation.stage == WARM_START:
+            wait_for_counts(bodies_inout.relaxed, pair, before)
+        else:
+            relax_pair(relaxation, p, pair, before, manifolds, constraints_inout, bodies_inout, relaxed)
+        if relaxation.stage != SOLVE:
+            hand_on_impulses(p, pair, manifolds, constraints_inout, bodies_inout)
+        publish_counts(bodies_inout.relaxed, pair, before + wp.vec2i(1, 1))
+        turn = take_turn(turns_inout, relaxation.passes + 1)

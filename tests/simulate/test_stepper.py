@@ -21,9 +21,9 @@ def fall(device):
     return run(heap(device), 80)
 
 
-@pytest.mark.parametrize("by_color", [False, True])
-def test_a_heap_falls_the_same_again_however_it_is_relaxed(device, by_color):
-    with testing.regime(relax_by_color=by_color):
+@pytest.mark.parametrize("warps", [1, None])
+def test_a_heap_falls_the_same_again_however_it_is_relaxed(device, warps):
+    with testing.regime(relaxing_warps=warps):
         dynamics = heap(device)
     assert np.array_equal(run(dynamics, 80), fall(device))
     assert dynamics.query.manifolds.count.numpy().sum() > 8
@@ -34,8 +34,8 @@ def test_a_body_in_more_contacts_than_colors(device):
     cubes = [(cube, (0.6 * x - 1.5, 0.6 * y - 1.5, 0.2495 + 0.1, 0, 0, 0, 1)) for x in range(6) for y in range(6)]
     plate = box(4, 4, 0.2)
     found = []
-    for by_color in (False, True):
-        with testing.regime(relax_by_color=by_color):
+    for warps in (1, None):
+        with testing.regime(relaxing_warps=warps):
             dynamics = on_ground(device, (plate, (0, 0, 0.0995, 0, 0, 0, 1)), *cubes)
         run(dynamics, 10)
         used, count = dynamics.constraints.color.numpy(), int(graph_coloring.COLOR_COUNT)

@@ -24,8 +24,7 @@ class Regime:
     full_refit: dict = field(default_factory=lambda: {"cpu": 0.5, "cuda": 0.2})
     block_updates: bool = True  # whether a block updates a tree state by itself where it can, not all by level lists
     packs_results: bool | None = None  # whether results are packed and sorted on the device first: on CUDA
-    # Whether contacts of rigid bodies are relaxed by color, a thread a pair: on CUDA; on the CPU one thread does it.
-    relax_by_color: bool | None = None
+    relaxing_warps: int | None = None  # that relax contacts of rigid bodies; on the CPU it is one thread
     captures_frames: bool | None = None  # whether frames without a clock of their own replay a graph: on CUDA they do
 
     def uses_warps(self, device) -> bool:

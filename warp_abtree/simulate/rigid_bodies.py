@@ -35,8 +35,7 @@ REST_DEPTH, REST_APART = 0.5, 1.0  # at which points rest, in slops: deep, or wi
 CORRECTION = 0.2  # part of the penetration that a step corrects, however deep
 FRICTION_MAX = 2.0**60  # beyond which float32 might have no product; nothing slides far below
 COLOR_ROUNDS = int(COLOR_COUNT)  # of the graph coloring
-LAST_COLORS = 10  # first of the last colors, which one block relaxes
-RELAXING_WARPS = 8  # of a processor, which relax the pairs of another color
+RELAXING_WARPS = 8  # of a processor
 
 
 class Dynamics(RigidBodies):
@@ -84,8 +83,6 @@ class Dynamics(RigidBodies):
         self.friction = float(finite_array(friction, "friction", ()))
         if self.friction < 0:
             raise ValueError(f"friction {friction!r} is below 0")
-        by_color = current_regime().relax_by_color
-        self._by_color = not self.device.is_cpu if by_color is None else by_color
         self.query = ManifoldQuery(scene, None, capacity, gap=AheadGapStage(scene, self.bodies), remember=remember)
         self.certified = None
         if continuous:
@@ -94,11 +91,10 @@ class Dynamics(RigidBodies):
         thin = np.where(slop < SLOP * radius, slop, np.inf)
         self._thinnest, self._thin_slop = int(thin.argmin()) if len(thin) else 0, thin.min(initial=np.inf)
         self._least_slop = slop.min(initial=np.inf)
-        # No body is in two pairs of a color; more warps than run at a time would wait.
-        warps = RELAXING_WARPS * self.device.sm_count if self.device.is_cuda else len(self.rigid)
-        self._color_warps = max(1, min(warps, int(np.count_nonzero(self.rigid))))
+        most = RELAXING_WARPS * self.device.sm_count if self.device.is_cuda else 1
+        self._warps = current_regime().relaxing_warps or most
         self._warm_start = constraint_kernels.WarmStart()
-        self._color_start = wp.empty(int(COLOR_COUNT) + 2, dtype=wp.int32, device=self.device)
+        self._turns = wp.zeros(2 + 2 * SUBSTEPS_MAX, dtype=wp.int32, device=self.device)
         self._room, self._interrupted = -1, False
         self._grow()
 
@@ -273,30 +269,17 @@ class Dynamics(RigidBodies):
                 self._launch(kernel, room, [turn, self.query.pair_batch, color, self.bodies])
         wp.copy(self._sorted_color, color, count=room)
         radix_sort(self._sorted_color, self._sorted_pair, room, 7)
-        self._launch(graph_coloring.find_color_kernel, room + 1, [self._sorted_color, self._color_start])
+        self._turns.zero_()
+        inputs = [self._sorted_color, self._sorted_pair, self.query.pair_batch, self.bodies, self.constraints.rank]
+        self._launch(graph_coloring.rank_pairs_kernel, room, [*inputs, self._turns])
 
     def _relax(self, each, stage):
-        """Relax all pairs: by one warp in one launch, or a launch for each of the first colors.
-
-        The last colors have few pairs: a block relaxes them.
-        """
+        """Relax all pairs once."""
         each.stage, each.backward = int(stage), int(stage == solve.RELAX)
-        if not self._by_color:
-            self._relax_colors(each, range(COLOR_COUNT + 1), 1)
-            return
-        parts: list[tuple] = [([color], self._color_warps) for color in range(LAST_COLORS)]
-        parts.append((range(LAST_COLORS, COLOR_COUNT + 1), solve.TAIL_WARPS))
-        for colors, warps in reversed(parts) if each.backward else parts:
-            self._relax_colors(each, colors, warps)
-
-    def _relax_colors(self, each, colors, warps):
-        if len(colors) > 1 and not self.device.is_cuda:
-            warps = 1  # blocks of one thread know no barrier
-        each.first_color, each.last_color, each.warps = colors[0], colors[-1], warps
-        arrays = [self._sorted_pair, self._color_start, self.query.pair_batch, self.query.manifolds, self._relaxed]
-        block = WARP_SIZE * (warps if len(colors) > 1 else 1)
-        threads = warps * (WARP_SIZE if self.device.is_cuda else 1)
-        self._launch(solve.relax_kernel, threads, [each, *arrays, self.constraints, self.bodies], block)
+        threads = min(self._warps, self._room) * (WARP_SIZE if self.device.is_cuda else 1)
+        inputs = [each, self._sorted_pair, self.query.pair_batch, self.query.manifolds, self._relaxed, self._turns]
+        self._launch(solve.relax_kernel, threads, [*inputs, self.constraints, self.bodies], WARP_SIZE)
+        each.passes += 1
 
 
 class SteppedMotion:
@@ -332,8 +315,6 @@ class SteppedMotion:
         device = self.dynamics.device
         for module in (body_kernels, constraint_kernels, graph_coloring, solve):
             wp.load_module(module, device)
-        if device.is_cuda:  # where a module is compiled for each size of blocks
-            wp.load_module(solve, device, block_dim=WARP_SIZE)
         self.aim(time)
         self.dynamics.find_contacts()
         if self.dynamics.certified is not None:

@@ -30,6 +30,38 @@ inline CUDA_CALLABLE wp::int32 take_slots(wp::array_t<wp::int32> total, wp::int3
 #endif
 }
 
+inline CUDA_CALLABLE wp::int32 take_turn(wp::array_t<wp::int32> taken, wp::int32 i) {
+#if defined(__CUDA_ARCH__)
+    int turn = 0;
+    if ((threadIdx.x & 31) == 0)
+        turn = atomicAdd(taken.data + i, 1);
+    return __shfl_sync(0xffffffffu, turn, 0);
+#else
+    return taken.data[i]++;
+#endif
+}
+
+inline CUDA_CALLABLE void wait_for_counts(wp::array_t<wp::int32> counts, wp::vec2i ids, wp::vec2i values) {
+#if defined(__CUDA_ARCH__)
+    const int lane = threadIdx.x & 31, least = lane == 0 ? values[0] : lane == 1 ? values[1] : 0;
+    int* count = counts.data + (lane == 0 ? ids[0] : ids[1]);
+    if (least > 0)
+        while (__nv_atomic_load_n(count, __NV_ATOMIC_ACQUIRE, __NV_THREAD_SCOPE_DEVICE) < least)
+            __nanosleep(20);
+    __syncwarp();
+#endif
+}
+
+inline CUDA_CALLABLE void publish_counts(wp::array_t<wp::int32> counts, wp::vec2i ids, wp::vec2i values) {
+#if defined(__CUDA_ARCH__)
+    const int lane = threadIdx.x & 31, value = lane == 0 ? values[0] : lane == 1 ? values[1] : 0;
+    __syncwarp();
+    if (value > 0)
+        __nv_atomic_store_n(counts.data + (lane == 0 ? ids[0] : ids[1]), value, __NV_ATOMIC_RELEASE,
+                            __NV_THREAD_SCOPE_DEVICE);
+#endif
+}
+
 inline CUDA_CALLABLE void add_warp_sum(wp::array_t<wp::int64> totals, wp::int32 i, wp::int32 x) {
 #if defined(__CUDA_ARCH__)
     long long sum = x;

@@ -72,6 +72,14 @@ inline CUDA_CALLABLE wp::int32 lowest_bit(wp::int32 bits) {
 #endif
 }
 
+inline CUDA_CALLABLE wp::int32 count_bits(wp::int32 bits) {
+#if defined(__CUDA_ARCH__)
+    return __popc(bits);
+#else
+    return __builtin_popcount(bits);
+#endif
+}
+
 inline CUDA_CALLABLE wp::float64 warp_min(wp::float64 x) {
 #if defined(__CUDA_ARCH__)
     for (int step = 16; step > 0; step >>= 1)

@@ -150,9 +150,6 @@ constexpr int TWIST_COUNT = 256;
 constexpr int RANDOM_TWISTS = 192;
 static_assert(RANDOM_TWISTS % 32 == 0 && TWIST_COUNT % 32 == 0, "vectors and halves of turns are whole");
 
-// Warps of a block that relaxes the last colors.
-constexpr int TAIL_WARPS = 8;
-
 // Slots of the contact witnesses of an object pair: bins of normals, of each the deepest and the farthest in eight
 // directions, of what crosses and of what is apart, and the deepest of what is apart inside.
 constexpr int NORMAL_BINS = 20;

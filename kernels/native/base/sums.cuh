@@ -3,23 +3,23 @@
 #include "builtin.h"
 #include "base/sizes.h"
 
-// In a block of so many warps.
-template <int WARPS, unsigned COUNT>
+// In a block of one warp.
+template <unsigned COUNT>
 CUDA_CALLABLE wp::vec_t<COUNT, wp::float64> add_lanes_in_order(wp::vec_t<COUNT, wp::float64> sum,
                                                                wp::vec_t<COUNT, wp::float64> x, wp::int32 count) {
 #if defined(__CUDA_ARCH__)
     // A column a lane, and one more so that rows begin in banks of their own; then a row a lane.
-    __shared__ double values[WARPS][COUNT][33];
-    const int warp = WARPS == 1 ? 0 : threadIdx.x >> 5, lane = threadIdx.x & 31, row = lane < COUNT ? lane : COUNT - 1;
+    __shared__ double values[COUNT][33];
+    const int lane = threadIdx.x, row = lane < COUNT ? lane : COUNT - 1;
     double total = sum[0];
 #pragma unroll
     for (int k = 0; k < COUNT; ++k) {
-        values[warp][k][lane] = x[k];
+        values[k][lane] = x[k];
         total = row == k ? sum[k] : total;
     }
     __syncwarp();
     for (int i = 0; i < count; ++i)
-        total += values[warp][row][i];
+        total += values[row][i];
     __syncwarp();
 #pragma unroll
     for (int k = 0; k < COUNT; ++k)
@@ -34,10 +34,10 @@ CUDA_CALLABLE wp::vec_t<COUNT, wp::float64> add_lanes_in_order(wp::vec_t<COUNT, 
 
 inline CUDA_CALLABLE wp::vec_t<6, wp::float64> add_in_order(wp::vec_t<6, wp::float64> sum, wp::vec_t<6, wp::float64> x,
                                                             wp::int32 count) {
-    return add_lanes_in_order<1>(sum, x, count);
+    return add_lanes_in_order(sum, x, count);
 }
 
 inline CUDA_CALLABLE wp::vec_t<9, wp::float64> add_nine_in_order(wp::vec_t<9, wp::float64> sum,
                                                                  wp::vec_t<9, wp::float64> x, wp::int32 count) {
-    return add_lanes_in_order<TAIL_WARPS>(sum, x, count);
+    return add_lanes_in_order(sum, x, count);
 }
