@@ -56,6 +56,7 @@ def test_slabs_hold_their_faces(device, name):
 @wp.kernel
 def compare_slabs_kernel(
     margin_factor: wp.float32,
+    within: wp.float64,
     trees: Trees,
     batch: PairBatch,
     nodes: wp.array(dtype=wp.vec2i),
@@ -64,19 +65,25 @@ def compare_slabs_kernel(
     """Note which nodes slabs do not separate."""
     i = wp.tid()
     pose = batch.poses[0]
-    pose.margin = pose.margin * margin_factor
+    pose.margin = wp.float32(wp.float64(pose.margin * margin_factor) + wp.float64(1.0000003) * within)
+    pose.within = within
     item = pack_item(nodes[i][0], nodes[i][1])
     overlap_out[i] = wp.where(slabs_overlap(trees, pose, item), 1, 0)
 
 
-def touching_soups(device, rng, count, reach_a, reach_b):
-    """Return a query of two soups, and their trees: faces of one number lie in about one plane and share a corner."""
+def touching_soups(device, rng, count, reach_a, reach_b, gap=0.0):
+    """Return a query of two soups, and their trees: faces of one number lie in about one plane and share a corner.
+
+    Or in two planes, so far apart.
+    """
     first = rng.uniform(-1, 1, (count, 1, 3))
     turn = quaternion_matrix(random_quaternions(rng, 1)[0])
     pose, faces = to_matrix(turn, rng.normal(size=3)), np.arange(3 * count).reshape(-1, 3)
     meet = into_frame_of_a(first.reshape(-1, 3), np.eye(4), pose).reshape(-1, 1, 3)
     plane, along = rng.normal(size=(count, 2, 3)), rng.uniform(-1, 1, (2, count, 2, 2))
     a = np.concatenate([meet, meet + reach_a * (along[0] @ plane)], 1)
+    normal = np.cross(plane[:, :1], plane[:, 1:])
+    first = first + gap * (normal / np.linalg.norm(normal, axis=2, keepdims=True)) @ turn
     b = np.concatenate([first, first + reach_b * (along[1] @ plane @ turn)], 1)
     models = [ab.Model.from_arrays(points.reshape(-1, 3), faces) for points in (a, b)]
     scene = ab.Scene(device)
@@ -84,16 +91,16 @@ def touching_soups(device, rng, count, reach_a, reach_b):
         scene.add(model, placed)
     query = GpuQuery(scene, "faces", pairs=[(0, 1)])
     rows = query.run().faces[:, 1:]
-    assert (rows[rows[:, 0] == rows[:, 1], 0] == np.arange(count)).all()
+    assert gap > 0 or (rows[rows[:, 0] == rows[:, 1], 0] == np.arange(count)).all()
     return query, [model.tree for model in models]
 
 
-def count_lost(query, trees, levels, margin_factor):
+def count_lost(query, trees, levels, margin_factor, within=0.0):
     """Return how many nodes so far above faces that meet slabs separate."""
     leaves = np.stack([tree.leaf_node for tree in trees], 1)
     nodes = wp.array(leaves >> levels, dtype=wp.vec2i, device=query.device)
     overlap = wp.zeros(len(nodes), dtype=wp.int32, device=query.device)
-    inputs = [margin_factor, query.batch.trees, query.pair_batch, nodes, overlap]
+    inputs = [margin_factor, within, query.batch.trees, query.pair_batch, nodes, overlap]
     wp.launch(compare_slabs_kernel, dim=len(nodes), inputs=inputs, device=query.device)
     return int((overlap.numpy() == 0).sum())
 
@@ -108,3 +115,15 @@ def test_margin_covers_rounding(device, reach_a, reach_b):
             assert count_lost(query, trees, levels, 1.0) == 0
         lost += count_lost(query, trees, 0, 0.0)
     assert lost > 100
+
+
+@pytest.mark.parametrize("gap", [1e-6, 1.0, 1e30])
+def test_slabs_keep_what_is_nearer_than_a_gap(device, gap):
+    """Faces in parallel planes a gap apart survive, as do the nodes above; within a little less most do not."""
+    rng = np.random.default_rng(9)
+    query, trees = touching_soups(device, rng, 128, 1.0, 1.0, gap if gap < 1e9 else 0.0)
+    for levels in range(3):
+        assert count_lost(query, trees, levels, 1.0, gap) == 0
+        assert count_lost(query, trees, levels, 1.0, 1e300 * gap) == 0
+    if 1e-3 < gap < 1e9:
+        assert count_lost(query, trees, 0, 1.0, 0.95 * gap) > 64
