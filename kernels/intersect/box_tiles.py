@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import LAST_KEY, ObjectPool, pair_key
-from warp_abtree.kernels.base.counters import reserve_slot
+from warp_abtree.kernels.base.counters import take_slots
 from warp_abtree.kernels.base.lanes import (
     WARP_SIZE,
     count_lanes,
@@ -95,6 +95,42 @@ def load_tile_object(tile: wp.int32, filter: PairFilter, tiles: Tiles, boxes: Po
 
 
 @wp.func
+def has_bit(bits: wp.uint32, k: wp.int32):
+    return ((bits >> wp.uint32(k)) & wp.uint32(1)) != wp.uint32(0)
+
+
+@wp.func
+def list_columns(
+    row: wp.int32,
+    column: wp.int32,
+    word: wp.int32,
+    count: wp.int32,
+    boxes: PosedBounds,
+    pairs: wp.array(dtype=wp.vec2i),
+):
+    """List the pairs of a warp's objects, after all that are listed, with one atomic.
+
+    Args:
+        row, column: This lane's objects.
+        word: The lanes whose columns meet its row, a bit each.
+        count: How many these are.
+    """
+    end, lane, total = wp.int32(0), warp_lane(), warp_sum(count)
+    if total > 0:
+        if lane == 0:
+            end = take_slots(boxes.pair_count, total)
+        end = hold_uniform(end)
+        rows = vote_lanes(count > 0)
+        while rows != wp.uint32(0):
+            k = lowest_bit(wp.int32(rows))
+            rows = drop_lowest_bit(rows)
+            i, meets = value_of_lane(row, k), has_bit(wp.uint32(value_of_lane(word, k)), lane)
+            slot = next_place(end, meets)
+            if meets:
+                write_pair(slot, i, column, pairs)
+
+
+@wp.func
 def find_columns(
     own: TileObject,
     rows: wp.uint32,
@@ -109,7 +145,7 @@ def find_columns(
     """Find the pairs of some objects of a tile, a bit each, with those behind them in another, one a lane."""
     column = load_tile_object(tile, filter, tiles, boxes)
     in_order, lane = tiles.meets.shape[0] > 0, warp_lane()
-    is_row = ((rows >> wp.uint32(lane)) & wp.uint32(1)) != wp.uint32(0)
+    is_row = has_bit(rows, lane)
     word, count = wp.int32(0), wp.int32(0)
     is_column = column.place < boxes.lower.shape[0]
     while rows != wp.uint32(0):
@@ -125,15 +161,12 @@ def find_columns(
         if warp_any(meets):
             if meets:
                 meets = may_pair(i, column.object, filter, objects)
-            if in_order:
-                bits, number = vote_lanes(meets), count_lanes(meets)
-                word = wp.where(lane == k, wp.int32(bits), word)
-                count = wp.where(lane == k, number, count)
-            else:
-                slot = reserve_slot(boxes.pair_count, meets)
-                if meets:
-                    write_pair(slot, i, column.object, pairs)
-    if in_order and is_row:
+            bits, number = vote_lanes(meets), count_lanes(meets)
+            word = wp.where(lane == k, wp.int32(bits), word)
+            count = wp.where(lane == k, number, count)
+    if not in_order:
+        list_columns(own.object, column.object, word, count, boxes, pairs)
+    elif is_row:
         tiles.meets[warp_size() * task + lane] = word
         if count > 0:
             wp.atomic_add(boxes.first_count, own.object, count)
@@ -225,8 +258,7 @@ def list_tile_pair_kernel(
         while words != wp.uint32(0):
             k = lowest_bit(wp.int32(words))
             words = drop_lowest_bit(words)
-            bits = wp.uint32(value_of_lane(word, k))
-            meets = ((bits >> wp.uint32(lane)) & wp.uint32(1)) != wp.uint32(0)
+            meets = has_bit(wp.uint32(value_of_lane(word, k)), lane)
             slot = next_place(end, meets)
             if meets:
                 pair = wp.vec2i(i, tiles.order[size * tasks[first + k][1] + lane])
