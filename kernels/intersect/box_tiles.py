@@ -41,8 +41,8 @@ from warp_abtree.kernels.intersect.broad_phase import (
 wp.set_module_options(native.options("base/counters.cuh", "base/lanes.cuh") | {"block_dim": WARP_SIZE})
 
 # Bits of a place on the Morton curve, and cells along an axis.
-CURVE_BITS = 30
-CURVE_CELLS = wp.constant(wp.float32(1023.0))
+CURVE_BITS = 24
+CURVE_CELLS = wp.constant(wp.float32(255.0))
 
 
 @wp.struct
@@ -275,26 +275,25 @@ def list_tile_pair_kernel(
 
 
 @wp.kernel
-def bound_middle_kernel(step: wp.int32, boxes: PosedBounds, ends_inout: wp.array(dtype=wp.float32)):
+def bound_middle_kernel(step: wp.int32, boxes_inout: PosedBounds):
     """Bound the middles of all boxes, in a grid-stride loop: the least of each axis, and of the other way."""
     i = wp.tid()
-    least, most = box_middle(boxes, 0), -box_middle(boxes, 0)
-    while i < boxes.lower.shape[0]:
-        middle = box_middle(boxes, i)
+    least, most = box_middle(boxes_inout, 0), -box_middle(boxes_inout, 0)
+    while i < boxes_inout.lower.shape[0]:
+        middle = box_middle(boxes_inout, i)
         least = wp.min(least, middle)
         most = wp.min(most, -middle)
         i += step
     for k in range(3):
         low, high = warp_min32(least[k]), warp_min32(most[k])
         if warp_lane() == 0:
-            wp.atomic_min(ends_inout, k, low)
-            wp.atomic_min(ends_inout, 3 + k, high)
+            wp.atomic_min(boxes_inout.ends, k, low)
+            wp.atomic_min(boxes_inout.ends, 3 + k, high)
 
 
 @wp.func
 def spread_bits(x: wp.int32):
-    """Return ten bits with two zeros in front of each."""
-    x = (x | (x << 16)) & 0x030000FF
+    """Return eight bits with two zeros in front of each."""
     x = (x | (x << 8)) & 0x0300F00F
     x = (x | (x << 4)) & 0x030C30C3
     return (x | (x << 2)) & 0x09249249
@@ -302,7 +301,6 @@ def spread_bits(x: wp.int32):
 
 @wp.kernel
 def make_curve_key_kernel(
-    ends: wp.array(dtype=wp.float32),
     filter: PairFilter,
     boxes: PosedBounds,
     order_out: wp.array(dtype=wp.int32),
@@ -312,9 +310,9 @@ def make_curve_key_kernel(
     i = wp.tid()
     middle, code = box_middle(boxes, i), wp.int32(0)
     for k in range(3):
-        low = ends[k]
+        low = boxes.ends[k]
         # Of no width: an order alone, on which no pair depends.
-        width = wp.max(-ends[3 + k] - low, wp.float32(1.0e-30))
+        width = wp.max(-boxes.ends[3 + k] - low, wp.float32(1.0e-30))
         cell = wp.int32(wp.clamp((middle[k] - low) / width, wp.float32(0.0), wp.float32(1.0)) * CURVE_CELLS)
         code = code | (spread_bits(cell) << k)
     order_out[i] = i

@@ -27,6 +27,8 @@ class PosedBounds:
     pair_count: wp.array(dtype=wp.int32)  # perhaps more than there is room for, below 0 where it overflowed, shape [1]
     # Pairs of which each object is the first, then sums of COUNT_CHUNK objects; [0] where pairs are found in no order.
     first_count: wp.array(dtype=wp.int32)
+    # Least middle of all boxes along each axis, and along the other way, where they are sorted, shape [6] or [0].
+    ends: wp.array(dtype=wp.float32)
 
 
 @wp.struct
@@ -49,6 +51,8 @@ def write_bounds(i: wp.int32, lower: wp.vec3, upper: wp.vec3, boxes: PosedBounds
     boxes.upper[i] = upper
     if i == 0:
         boxes.pair_count[0] = 0
+        for k in range(boxes.ends.shape[0]):
+            boxes.ends[k] = wp.inf
     if boxes.first_count.shape[0] > 0:
         boxes.first_count[i] = 0
         if i % COUNT_CHUNK == 0:

@@ -111,7 +111,7 @@ class TileSearch:
             # Few enough to be launched, many enough to share the work.
             most = self._lanes * max(1, -(-int(others.sum()) // (self._lanes * SORTED_TASKS)))
             self._key = wp.empty(2 * count, dtype=wp.int64, device=self.device)
-            self._ends = wp.empty(6, dtype=wp.float32, device=self.device)
+            broad_phase.bounds.ends = wp.empty(6, dtype=wp.float32, device=self.device)
             self.tiles.order = wp.empty(2 * count, dtype=wp.int32, device=self.device)
         self._tasks = wp.array(list_tasks(others, most), dtype=wp.vec3i, device=self.device)
         self._key_bits = box_tiles.CURVE_BITS + int(group.max(initial=0)).bit_length()
@@ -133,9 +133,8 @@ class TileSearch:
         warps = {"device": self.device, "block_dim": WARP_SIZE}
         if self.sorts:
             step = self._lanes * max(1, min(self._tile_count, 4 * self.device.sm_count if self.device.is_cuda else 1))
-            inputs = [self._ends, found.filter, found.bounds, self.tiles.order, self._key]
-            bound = [step, found.bounds, self._ends]
-            made.append(launch(box_tiles.bound_middle_kernel, dim=step, inputs=bound, **warps))
+            inputs = [found.filter, found.bounds, self.tiles.order, self._key]
+            made.append(launch(box_tiles.bound_middle_kernel, dim=step, inputs=[step, found.bounds], **warps))
             made.append(launch(box_tiles.make_curve_key_kernel, dim=count, inputs=inputs, **warps))
             dim = self._lanes * self._tile_count
             made.append(launch(box_tiles.bound_tile_kernel, dim=dim, inputs=[found.bounds, self.tiles], **warps))
@@ -153,8 +152,6 @@ class TileSearch:
 
     def launch(self, launches: list):
         """Launch what boxes the objects, and what `make` made, with a sort between them."""
-        if self.sorts:
-            self._ends.fill_(np.inf)
         for launch in launches[:SORT_AFTER]:
             launch()
         if self.sorts:
