@@ -35,7 +35,7 @@ REST_DEPTH, REST_APART = 0.5, 1.0  # at which points rest, in slops: deep, or wi
 CORRECTION = 0.2  # part of the penetration that a step corrects, however deep
 FRICTION_MAX = 2.0**60  # beyond which float32 might have no product; nothing slides far below
 COLOR_ROUNDS = int(COLOR_COUNT)  # of the graph coloring
-RELAXING_WARPS = 8  # of a processor
+RELAXING_WARPS = 12  # of a processor
 
 
 class Dynamics(RigidBodies):
