@@ -7,7 +7,7 @@ Source: Luby 1986; Jones and Plassmann 1993.
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.lanes import count_bits, lowest_bit
+from warp_abtree.kernels.base.lanes import count_set_bits, lowest_bit
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, Bodies
 
@@ -79,7 +79,7 @@ def assign_color_kernel(
 @wp.func
 def rank_among(i: wp.int32, color: wp.int32, bodies: Bodies):
     """Return how many pairs of a body have lower colors."""
-    return count_bits(bodies.colors[i] & ((1 << color) - 1))
+    return count_set_bits(bodies.colors[i] & ((1 << color) - 1))
 
 
 @wp.func

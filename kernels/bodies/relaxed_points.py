@@ -193,7 +193,7 @@ def half_shift(pair: wp.vec2i, bodies: Bodies):
 
 
 @wp.func
-def place_point(
+def load_point(
     relaxation: Relaxation,
     units: Units,
     own: RelaxedPair,
@@ -237,7 +237,7 @@ def start_point(
     constraints: Constraints,
     bodies: Bodies,
 ):
-    """Give a placed point the speeds and impulses that a pass begins with; return how fast it approaches.
+    """Give a point the speeds and impulses that a pass begins with; return how fast it approaches.
 
     That is in world units/s.
     """

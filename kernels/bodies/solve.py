@@ -16,7 +16,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.counters import publish_counts, take_turn, wait_for_counts
 from warp_abtree.kernels.base.lanes import (
     WARP_SIZE,
-    count_bits,
+    count_set_bits,
     lane_in_turn,
     resolve_lane,
     vector_of_lane,
@@ -36,9 +36,9 @@ from warp_abtree.kernels.bodies.relaxed_points import (
     Units,
     act_at_point,
     half_shift,
+    load_point,
     load_side,
     make_units,
-    place_point,
     push,
     relax_point,
     speed_unit,
@@ -134,7 +134,7 @@ def count_turns(relaxation: Relaxation, i: wp.int32, rank: wp.int32, bodies: Bod
 
     -1 if nothing changes its motion.
     """
-    pairs = count_bits(bodies.colors[i]) + bodies.uncolored[i]
+    pairs = count_set_bits(bodies.colors[i]) + bodies.uncolored[i]
     before = relaxation.passes * pairs + point_of_turn(rank, pairs, relaxation.backward)
     return wp.where(bodies.motion_type[i] == DYNAMIC, before, -1)
 
@@ -165,7 +165,7 @@ def relax_pair(
     own.struck = wp.where(stage == RELAX, constraints.is_struck[p], 0)
     point = RelaxedPoint()
     for k in range(resolve_lane(), count, lanes):
-        point = place_point(relaxation, units, own, p, k, pair, manifolds, constraints, bodies)
+        point = load_point(relaxation, units, own, p, k, pair, manifolds, constraints, bodies)
         if lanes == 1:
             relaxed[p, k] = point
     wait_for_counts(bodies.relaxed, pair, turns)

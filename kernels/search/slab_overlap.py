@@ -26,7 +26,7 @@ INVERSE_SQUARE = wp.constant(wp.float32(2.0**-28))
 # Twice eight margins of boxes for a direction of length 2^14.
 MARGINS = wp.constant(wp.float32(2.0**18))
 # Twice a distance along it, and what it is longer by and rounding makes of that; no distance is infinite.
-DISTANCES, WITHIN_MAX = wp.constant(wp.float32(1.01 * 2.0**15)), wp.constant(wp.float32(2.0**126))
+WITHIN_FACTOR, WITHIN_MAX = wp.constant(wp.float32(1.01 * 2.0**15)), wp.constant(wp.float32(2.0**126))
 
 
 @wp.struct
@@ -113,7 +113,7 @@ def slabs_overlap(trees: Trees, pose: PairPose, item: wp.int64):
     b_there = map_point(pose.rotation32, zero, b.direction)
     ratio = add_product(a.direction, b_there, 0.0) * INVERSE_SQUARE
     within = wp.min(wp.float32(pose.within), WITHIN_MAX)
-    margin = fuse32(DISTANCES, within, MARGINS * (pose.margin - within))
+    margin = fuse32(WITHIN_FACTOR, within, MARGINS * (pose.margin - within))
     sum_a, size_a = node_a.upper + node_a.lower, node_a.upper - node_a.lower
     sum_b, size_b = node_b.upper + node_b.lower, node_b.upper - node_b.lower
     by_a = overlaps_along(a, b, a_there, pose.translation32, sum_b, size_b, ratio, margin)

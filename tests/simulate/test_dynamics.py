@@ -1,4 +1,4 @@
-"""Rigid bodies against closed forms and plain Python; prescribed motion, graph coloring and reports of budgets."""
+"""Rigid bodies against closed forms and plain Python; prescribed motion, and reports of budgets."""
 
 import warnings
 from dataclasses import replace
@@ -7,7 +7,6 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
-import warp as wp
 from helpers import refused
 from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, TORUS, about, box, make, model_of, on_ground, run
 from helpers.samples import grid
@@ -15,10 +14,6 @@ from trimesh.transformations import quaternion_matrix, rotation_matrix
 
 import warp_abtree as ab
 from warp_abtree.checks.quaternions import matrices_of, quaternions_of
-from warp_abtree.checks.upload import zeros_of
-from warp_abtree.kernels.base.poses import PairBatch
-from warp_abtree.kernels.bodies import bodies as body_kernels
-from warp_abtree.kernels.bodies import graph_coloring
 from warp_abtree.simulate.body_state import mass_properties
 from warp_abtree.simulate.budget_report import budget_report, cost_at_coarsest
 from warp_abtree.simulate.frame_row import FrameRow
@@ -254,64 +249,6 @@ def test_a_heavy_cube_stands_on_a_light_one(device):
     dynamics = on_ground(device, (CUBE, (0, 0, 0.5, 0, 0, 0, 1)), (box(4, 4, 4), (0, 0, 3, 0, 0, 0, 1)))
     run(dynamics, 240, 1 / 60)
     np.testing.assert_allclose(dynamics.poses()[1:, :3], [[0, 0, 0.5], [0, 0, 3]], atol=0.015)
-
-
-COLORS = int(graph_coloring.COLOR_COUNT)
-
-
-def color_pairs(device, pairs, dynamic, inactive=0):
-    """Return the color of each pair, COLORS where it has none, and the bodies; the first ones are inactive."""
-    bodies = zeros_of(body_kernels.Bodies, len(dynamic), 0, device)
-    bodies.motion_type.assign(np.where(dynamic, int(body_kernels.DYNAMIC), 0))
-    bodies.rank.assign(np.arange(len(dynamic)))
-    start = np.where(np.arange(len(pairs)) < inactive, int(graph_coloring.INACTIVE), COLORS)
-    color = wp.array(start, dtype=wp.int32, device=device)
-    batch = PairBatch()
-    batch.pairs = wp.array(pairs, dtype=wp.vec2i, device=device)
-    for turn in range(COLORS):
-        for kernel in (graph_coloring.bid_kernel, graph_coloring.assign_color_kernel):
-            wp.launch(kernel, len(pairs), [turn, batch, color, bodies], device=device)
-    return color.numpy(), bodies
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_no_moving_body_is_twice_in_a_color(device, seed):
-    rng = np.random.default_rng(seed)
-    pairs = np.unique(np.sort(rng.integers(0, 300, (750, 2)), axis=1), axis=0)
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    dynamic = rng.uniform(size=300) < 0.9
-    pairs = pairs[dynamic[pairs].any(1)]
-    degree = np.bincount(pairs.ravel(), minlength=300)[dynamic].max()
-    color, _bodies = color_pairs(device, pairs, dynamic)
-    assert np.array_equal(color, color_pairs(device, pairs, dynamic)[0]), "the same again"
-    for c in range(COLORS):
-        movers = pairs[color == c].ravel()
-        movers = movers[dynamic[movers]]
-        assert len(set(movers.tolist())) == len(movers)
-    # Hardly more than there must be, and hardly a pair without.
-    assert degree <= len(set(color.tolist())) <= degree + 2 and (color == COLORS).mean() < 0.01
-
-
-@pytest.mark.parametrize("inactive", [0, 7])
-def test_a_pair_knows_how_many_are_relaxed_before_it(device, inactive):
-    rng = np.random.default_rng(2)
-    pairs = np.unique(np.sort(rng.integers(0, 120, (400, 2)), axis=1), axis=0)
-    # A hub has more pairs than there are colors.
-    pairs = np.concatenate([pairs[(pairs[:, 0] != pairs[:, 1]) & (pairs[:, 0] > 0)], [(0, k) for k in range(1, 60)]])
-    dynamic = np.arange(120) % 10 != 5
-    color, bodies = color_pairs(device, pairs, dynamic, inactive)
-    order = np.argsort(color, kind="stable")
-    lists = (np.concatenate([x, x]).astype(np.int32) for x in (color[order], order))
-    batch, rank = PairBatch(), wp.zeros(len(pairs), dtype=wp.vec2i, device=device)
-    batch.pairs, count = wp.array(pairs, dtype=wp.vec2i, device=device), wp.zeros(1, dtype=wp.int32, device=device)
-    inputs = [wp.array(x, device=device) for x in lists] + [batch, bodies, rank, count]
-    wp.launch(graph_coloring.rank_pairs_kernel, len(pairs), inputs, device=device)
-    assert (color == COLORS).sum() > 40 and count.numpy()[0] == len(pairs) - inactive
-    before = np.zeros(120, int)
-    for p in order[: len(pairs) - inactive]:
-        for k in np.flatnonzero(dynamic[pairs[p]]):
-            assert rank.numpy()[p, k] == before[pairs[p, k]]
-            before[pairs[p, k]] += 1
 
 
 def test_motion_in_a_straight_line_and_about_an_axis():

@@ -72,7 +72,7 @@ inline CUDA_CALLABLE wp::int32 lowest_bit(wp::int32 bits) {
 #endif
 }
 
-inline CUDA_CALLABLE wp::int32 count_bits(wp::int32 bits) {
+inline CUDA_CALLABLE wp::int32 count_set_bits(wp::int32 bits) {
 #if defined(__CUDA_ARCH__)
     return __popc(bits);
 #else
