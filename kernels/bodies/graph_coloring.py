@@ -19,6 +19,9 @@ COLOR_COUNT = wp.constant(16)
 INACTIVE = wp.constant(127)
 """Color of pairs that are not solved."""
 
+GOLDEN_RATIO = wp.constant(wp.uint32(2654435761))
+"""2^32 over it, which spreads the numbers of rounds."""
+
 
 @wp.func
 def make_bid(p: wp.int32, turn: wp.int32, pair: wp.vec2i, bodies: Bodies):
@@ -30,7 +33,7 @@ def make_bid(p: wp.int32, turn: wp.int32, pair: wp.vec2i, bodies: Bodies):
     Bits: 63..56 round + 1 | 55 zero | 54..31 hash | 30..0 pair
     """
     mixed = wp.uint32(bodies.rank[pair[0]]) * wp.uint32(40503) + wp.uint32(bodies.rank[pair[1]])
-    mixed += wp.uint32(turn) * wp.uint32(2654435761)
+    mixed += wp.uint32(turn) * GOLDEN_RATIO
     mixed = (mixed ^ (mixed >> wp.uint32(15))) * wp.uint32(739982445)
     mixed = (mixed ^ (mixed >> wp.uint32(12))) & wp.uint32(0xFFFFFF)
     return (wp.int64(turn + 1) << wp.int64(56)) | (wp.int64(mixed) << wp.int64(31)) | wp.int64(p)

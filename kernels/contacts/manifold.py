@@ -36,7 +36,8 @@ class Witnesses:
     normal: wp.array(dtype=wp.vec3d)  # unit, from the pair's first object to its second, shape [witness]
     point: wp.array2d(dtype=wp.vec3d)  # [world units], shape [witness, COLUMN_CORNERS]
     depth: wp.array2d(dtype=wp.float64)  # [world units], NO_DEPTH or NO_POINT, shape [witness, COLUMN_CORNERS]
-    nearest_only: wp.array(dtype=wp.int32)  # whether another face may be nearer, 0 or 1, shape [witness]
+    nearest_only: wp.array(dtype=wp.int32)  # those whose points another face may be nearer to, in any order, [witness]
+    nearest_total: wp.array(dtype=wp.int32)  # how many these are, shape [1]
     wrench: wp.array(dtype=wp.vec4)  # see `points`, shape [2 * COLUMN_CORNERS * witness]
 
 
@@ -183,8 +184,13 @@ def find_crossing_kernel(
     rows: WitnessRows,
     witnesses_out: Witnesses,
 ):
-    """Find the normal and the candidate points of one witness of faces that cross a thread, or that there is none."""
+    """Find the normal and the candidate points of one witness of faces that cross a thread, or that there is none.
+
+    No witness of faces that are apart is listed yet.
+    """
     w = wp.tid()
+    if w == 0:
+        witnesses_out.nearest_total[0] = 0
     if w >= wp.min(hits.witness_total[0], rows.item.shape[0]):
         return
     item = rows.item[w]

@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, Trees
+from warp_abtree.kernels.base.counters import take_slots
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.contacts.column import COLUMN_CORNERS, FacePair, load_pair
 from warp_abtree.kernels.contacts.contact import Contacts, PairObjects, contact_objects
@@ -18,7 +19,7 @@ from warp_abtree.kernels.contacts.separation import write_near_contact
 from warp_abtree.kernels.contacts.slots import WitnessRows, tree_size
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK, Hits
 
-wp.set_module_options(native.options("contacts/candidates.cuh", "exact/double_word.cuh"))
+wp.set_module_options(native.options("base/counters.cuh", "contacts/candidates.cuh", "exact/double_word.cuh"))
 
 # A face's normal serves where the other face looks against it within 60 degrees.
 OPPOSED_LEAST = wp.constant(wp.float64(0.5))
@@ -78,7 +79,7 @@ def write_nearest_points(
     """Write the middle of the nearest points of a contact as its candidate, where both faces look at one another.
 
     Of parallel edges, both ends of what they share. The normal is the direction of the distance; where faces touch,
-    that of the face that has the other in front.
+    that of the face that has the other in front. Returns whether both look at one another.
 
     Args:
         touching: As `which_touches`.
@@ -93,7 +94,6 @@ def write_nearest_points(
     ahead = wp.dot(n, contacts.normal_a[w]) > LEAST_AHEAD and wp.dot(n, contacts.normal_b[w]) < -LEAST_AHEAD
     shared = bool(False)
     witnesses.normal[w] = n
-    witnesses.nearest_only[w] = wp.where(ahead, 1, 0)
     if ahead:
         shared = find_along_edges(objects, pair, n, contacts.separation[w], w, witnesses)
     if not shared:
@@ -104,6 +104,7 @@ def write_nearest_points(
         middle = (first + back * (contacts.p1[w] - position) * pose.scale) * (wp.float64(0.5) / pose.scale)
         witnesses.depth[w, 0] = -contacts.separation[w]
         witnesses.point[w, 0] = pose_point(rotation, position, middle)
+    return ahead
 
 
 @native.func_native()
@@ -115,11 +116,11 @@ def find_facing(
     side: wp.int32,
     w: wp.int32,
     witnesses: Witnesses,
-) -> bool:
-    """Write the corners of the column of faces that look at one another as candidates; return whether they serve.
+) -> wp.int32:
+    """Write the corners of the column of faces that look at one another as candidates; return 0 if they don't serve.
 
     Along the normal of either face, whichever leaves the wider gap, if that is the distance. A face that lies behind
-    the other one's plane is inside, as deep as it is far.
+    the other one's plane is inside, as deep as it is far; then 2 is returned, else 1.
 
     Args:
         side: 1 or 2 for the normal of the first face or of the second alone: that of a face that an edge or a corner
@@ -152,7 +153,6 @@ def find_near_witness_kernel(
     if w >= wp.min(hits.witness_total[0], rows.item.shape[0]):
         return
     item = rows.item[w]
-    witnesses_out.nearest_only[w] = 0
     if item[0] < NEAR_BIT:
         return
     p = item[0] & PAIR_MASK
@@ -161,13 +161,13 @@ def find_near_witness_kernel(
     write_near_contact(w, trees, own, pose, item, contacts_out)
     n, normal_a, normal_b = contacts_out.normal[w], contacts_out.normal_a[w], contacts_out.normal_b[w]
     # Of what touches rounding may tell the direction.
-    served, touch = bool(False), contacts_out.separation[w] * pose.scale < NO_DISTANCE
+    served, nearest_only, touch = wp.int32(0), bool(False), contacts_out.separation[w] * pose.scale < NO_DISTANCE
     pair = load_pair(trees, pose, own.a, item, normal_a, normal_b)
     touching = which_touches(w, trees, own, pose, pair, contacts_out)
     if contacts_out.separation[w] >= gap[p]:
         for k in range(COLUMN_CORNERS):
             witnesses_out.depth[w, k] = NO_POINT
-        served = bool(True)
+        served = wp.int32(1)
     else:
         opposed, separation = -wp.dot(normal_a, normal_b), contacts_out.separation[w]
         ahead_a, ahead_b = wp.dot(n, normal_a), -wp.dot(n, normal_b)
@@ -176,12 +176,13 @@ def find_near_witness_kernel(
         if not touch and (ahead_a >= ALONG) != (ahead_b >= ALONG):
             side = wp.where(ahead_a >= ALONG, 1, 2)
         k, last = wp.where(facing, 0, 1), wp.where(side != 0 and opposed > LEAST_AHEAD, 1, 0)
-        while k <= last and not served:
+        while k <= last and served == 0:
             served = find_facing(
                 trees.objects, pair, gap[p], separation, wp.where(k == 0, touching, side), w, witnesses_out
             )
-            if served and k == 1 and not touch:
-                witnesses_out.nearest_only[w] = 1
+            nearest_only = served == 2 or (served == 1 and k == 1 and not touch)
             k += 1
-    if not served:
-        write_nearest_points(w, trees.objects, pair, pose, touching, contacts_out, witnesses_out)
+    if served == 0:
+        nearest_only = write_nearest_points(w, trees.objects, pair, pose, touching, contacts_out, witnesses_out)
+    if nearest_only:
+        witnesses_out.nearest_only[take_slots(witnesses_out.nearest_total, 1)] = w

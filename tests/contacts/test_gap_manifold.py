@@ -124,12 +124,14 @@ def test_edges_have_points_only_where_no_other_face_is_nearer(device, named):
     query = ask_points(device, *((torus, pose) for pose in poses), pairs=[named], gap=0.15)[0]
     count, near, witnesses = query.hits.witness_total.numpy()[0], query.near_contacts, query.witnesses
     items = query.witness_rows.item.numpy()[:count]
-    depth, nearest_only = witnesses.depth.numpy()[:count], witnesses.nearest_only.numpy()[:count]
+    depth, total = witnesses.depth.numpy()[:count], witnesses.nearest_total.numpy()[0]
     ends = near.p0.numpy()[:count], near.p1.numpy()[:count]
     vertices, faces, _ = torus.mesh_at(torus.lod_max)
     worlds = [(vertices @ quaternion_matrix(poses[i][3:]).T + poses[i][:3])[faces] for i in named]
     kept, dropped = 0, 0
-    for w in np.flatnonzero((items[:, 0] >= 2**30) & (nearest_only == 1)):
+    nearest_only = np.unique(witnesses.nearest_only.numpy()[:total])
+    assert len(nearest_only) == total and (items[nearest_only, 0] >= 2**30).all()
+    for w in nearest_only:
         nearest = np.inf
         for k in range(2):
             p = np.tile(ends[k][w], (len(faces), 1))

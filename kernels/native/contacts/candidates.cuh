@@ -55,8 +55,8 @@ CUDA_CALLABLE wp::int32 touching_faces(const Objects& objects, const Pair& pair,
 }
 
 template <class Objects, class Pair, class Witnesses>
-CUDA_CALLABLE bool find_facing(const Objects& objects, const Pair& pair, wp::float64 gap, wp::float64 separation,
-                               wp::int32 side, wp::int32 w, const Witnesses& witnesses) {
+CUDA_CALLABLE wp::int32 find_facing(const Objects& objects, const Pair& pair, wp::float64 gap, wp::float64 separation,
+                                    wp::int32 side, wp::int32 w, const Witnesses& witnesses) {
     typedef OneCrossing C;
     const C::Faces faces = faces_of(pair);
     const auto& rotation = objects.rotation.data[pair.object].data;
@@ -77,11 +77,10 @@ CUDA_CALLABLE bool find_facing(const Objects& objects, const Pair& pair, wp::flo
     const bool serves = fabs(fabs(best.depth) - separation) <= slack;
     if (serves) {
         CandidateWriter<Objects, Witnesses> writer = {objects, witnesses, pair.object, w, -gap, 0.0};
-        witnesses.nearest_only.data[w] = best.depth > slack;
         writer.write_normal(best.normal);
         writer.write_corners(C::Column(faces, best.normal, normal_a, normal_b));
     }
-    return serves;
+    return serves ? (best.depth > slack ? 2 : 1) : 0;
 }
 
 template <class Objects, class Pair, class Witnesses>

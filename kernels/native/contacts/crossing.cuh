@@ -76,7 +76,7 @@ struct Crossings : Columns<Number> {
             const lanes toward = greater(toward_a, toward_b);
             const bits contrary = (toward >= FACING) & (toward <= LIKENESS) & (lesser(toward_a, toward_b) < -FACING);
             // Of columns only normals and depths are kept: a second one beside the first does not fit into registers.
-            Measured best = {loop, C::no_depth(), touches & (least == 0.0) ? slack : lanes{}};
+            Measured best = {loop, C::no_depth(), (touches & (least == 0.0)) ? slack : lanes{}};
 #pragma unroll 1
             for (int k = 0; k < 3; ++k) {
                 Point n = k == 1 ? normal_a : negate(normal_b);

@@ -130,7 +130,7 @@ struct NearOffer {
         const bits large = F::least(face_size(c.a), face_size(c.b)) * weight >= LARGE_FACE * gap;
         const bits of_a = shared | (over_b & large), of_b = shared | (over_a & large);
         // What touches beside a column, perhaps looking away, goes behind all that is in one.
-        const lanes rank = touches & ((column | over_a | over_b) == 0) ? separation + gap : separation;
+        const lanes rank = (touches & ((column | over_a | over_b) == 0)) ? separation + gap : separation;
         scores.offer(weight, vector_of(N::add(joined.at, zero + 0.5f, joined.way)), rank, counts);
         for (int k = 0; k < 6; ++k) {
             const bits near = (joined.height[k] <= gap) & (joined.height[k] >= -gap);

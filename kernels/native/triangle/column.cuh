@@ -136,7 +136,7 @@ struct Columns : Points64<Number> {
         CUDA_CALLABLE lanes find_depth(const lanes& least) const {
             lanes depth = no_depth();
             auto raise = [&](const bits& exists, const lanes& x) {
-                depth = exists & (x >= least) ? greater(depth, x) : depth;
+                depth = (exists & (x >= least)) ? greater(depth, x) : depth;
             };
             if (!Number::any(looks))
                 return depth;

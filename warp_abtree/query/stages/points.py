@@ -126,6 +126,7 @@ class PointStage(Stage):
             *fields(self.curves, rooms.hits, parent=wp.int32, loop=wp.int32, loop_normal=wp.vec3d, has_area=wp.int32),
             *fields(witnesses, (room, CANDIDATES), point=wp.vec3d, depth=wp.float64),
             *fields(witnesses, room, normal=wp.vec3d, nearest_only=wp.int32),
+            Array(witnesses, "nearest_total", wp.int32, 1, 0),
             Array(witnesses, "wrench", wp.vec4, 2 * CANDIDATES * room),
             *(near if self._with_gap else []),
             Array(self.manifolds, "count", wp.int32, rooms.pairs, 0),
@@ -150,8 +151,8 @@ class PointStage(Stage):
         launch(manifold.find_crossing_kernel, some, inputs, WARP_SIZE)
         if self._with_gap:
             launch(near_points.find_near_witness_kernel, some, [*posed, *found, self.near, self.witnesses], WARP_SIZE)
-            inputs = [*posed[:2], *found, self.near, self.witnesses]
-            launch(nearest_contacts.keep_nearest_kernel, some, inputs, WARP_SIZE)
+            inputs = [*posed[:2], self._slots.rows, self.near, self.witnesses]
+            launch(nearest_contacts.keep_nearest_kernel, 2 * some, inputs, WARP_SIZE)
         self._choose_points([operator.batch.objects.pool, operator.pair_batch, self._twists, gap])
         if self._originals is not None:
             self._originals.project(gap, self._contacts.faces, self._slots.rows, self.manifolds)
