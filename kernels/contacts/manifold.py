@@ -121,6 +121,7 @@ def offer_crossing_kernel(
     pair, has_area = load_crossing(i, trees, batch, faces[i], contacts), curves.has_area[root] != 0
     loop, shell = curves.loop_normal[root], gap_of(gap, p)
     offer_crossing(trees, batch.poses[p], pair, loop, has_area, shell, i, p, slots_inout)
+    slots_inout.used[p] = 1
 
 
 @native.func_native(cpu=True)
@@ -161,6 +162,7 @@ def offer_pair_crossing_kernel(
         a, span = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.vec2i(start[p], start[p + 1])
         shell = gap_of(gap, p)
         simd_offer_crossing(trees, batch.poses[p], a, shell, p, span, faces, contacts, curves, slots_inout)
+        slots_inout.used[p] = 1
 
 
 @wp.func

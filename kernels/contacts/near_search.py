@@ -83,6 +83,8 @@ def thread_near_search():
         simd.test_gap_pairs(trees, pose, waiting, faces, uncertain, apart, parted, tests)
         bounds = wp.vec2(wp.float32(found.hits.gap[pair] * pose.scale), slots.weight[pair])
         widths, count = slots.widths[pair], parted.apart
+        if count > 0:
+            slots.used[pair] = 1
         simd_offer_faces(
             trees.models, trees.states, pose, count, apart, bounds, slots.directions, widths, pair, slots.key
         )

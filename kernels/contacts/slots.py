@@ -45,6 +45,7 @@ class Slots:
     """Slots of all object pairs."""
 
     key: wp.array(dtype=wp.int64)  # unsigned, 0 where there is none, shape [SLOT_ROOM * pair]
+    used: wp.array(dtype=wp.int32)  # whether anything was offered to those of a pair, 0 or 1, shape [pair]
     widths: wp.array(dtype=wp.vec2i)  # bits that a face of A takes, and one of B, shape [pair]
     weight: wp.array(dtype=wp.float32)  # of directions, shape [pair]
     directions: wp.array(dtype=wp.float32)  # normal of each bin and two vectors across it, shape [9 * NORMAL_BINS]
@@ -111,17 +112,22 @@ def count_bits(trees: Trees, state: wp.int32):
 def start_slots_kernel(
     trees: Trees, batch: PairBatch, gap: wp.array(dtype=wp.float64), hits_out: Hits, slots_out: Slots
 ):
-    """Empty one slot a thread, and measure the object pair of the first one.
+    """Empty the slots of one object pair, if they were used, and measure the pair, by a warp.
 
     Args:
         gap: Of each pair [world units], or [0] for none.
     """
-    i = wp.tid()
-    p = i / SLOT_ROOM
-    slots_out.key[i] = wp.int64(0)
-    if i == 0:
+    p, k = wp.tid() / warp_size(), warp_lane()
+    while k < SLOT_ROOM and slots_out.used[p] != 0:
+        slots_out.key[SLOT_ROOM * p + k] = wp.int64(0)
+        k += warp_size()
+    warp_sync()
+    if warp_lane() > 0:
+        return
+    slots_out.used[p] = 0
+    if p == 0:
         hits_out.witness_total[0] = 0
-    if i == p * SLOT_ROOM and p < batch.count[0] and p < batch.pairs.shape[0]:
+    if p < batch.count[0] and p < batch.pairs.shape[0]:
         shell = gap_of(gap, p)
         size = smaller_size(trees, batch.pairs[p][0], batch.pairs[p][1])
         weight = WEIGHT_LEAST
@@ -148,6 +154,7 @@ def offer_pair(
     a, b = load_points(trees, pose, pose.translation32 * scale, scale, face_a, face_b)
     reach, weight, widths = wp.float32(gap[pair] * pose.scale), slots.weight[pair], slots.widths[pair]
     offer_faces(a, b, reach, weight, slots.directions, widths, face_a, face_b, pair, slots.key)
+    slots.used[pair] = 1
 
 
 @wp.kernel
@@ -194,7 +201,8 @@ def reserve_witness_kernel(batch: PairBatch, slots: Slots, hits_inout: Hits, row
     """Reserve places for the witnesses of one object pair, by a warp: of near faces, and all that may yet cross."""
     p = wp.tid() / warp_size()
     found, first = wp.int32(0), wp.int32(0)
-    if p >= batch.count[0] or p >= batch.pairs.shape[0]:
+    is_pair = p < batch.count[0] and p < batch.pairs.shape[0]
+    if not is_pair or (slots.used[p] == 0 and hits_inout.count[p] == wp.int64(0)):
         if warp_lane() == 0:
             rows_out.count[p] = 0
         return

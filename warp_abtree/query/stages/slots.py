@@ -61,7 +61,8 @@ class SlotStage(Stage):
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return the slots, and what they keep."""
         return [
-            Array(self.slots, "key", wp.int64, slots.SLOT_ROOM * rooms.pairs),
+            Array(self.slots, "key", wp.int64, slots.SLOT_ROOM * rooms.pairs, 0),
+            Array(self.slots, "used", wp.int32, rooms.pairs, 0),
             *fields(self.slots, rooms.pairs, weight=wp.float32, widths=wp.vec2i),
             *fields(self.rows, rooms.pairs, start=wp.int32, count=wp.int32),
             Array(self.rows, "item", wp.vec3i, self.room(rooms)),
@@ -69,9 +70,9 @@ class SlotStage(Stage):
 
     def start(self):
         """Empty the slots, before the traversal offers to them. Launches only."""
-        operator, own = self.operator, self.slots
-        inputs = [operator.batch.trees, operator.pair_batch, operator.hits.gap, operator.hits, own]
-        operator.launch_kernel(slots.start_slots_kernel, len(own.key), inputs)
+        operator = self.operator
+        inputs = [operator.batch.trees, operator.pair_batch, operator.hits.gap, operator.hits, self.slots]
+        operator.launch_warps(slots.start_slots_kernel, operator.rooms.pairs, inputs)
 
     def search(self):
         """Offer what is listed as apart, and reserve places for witnesses. Launches only."""
