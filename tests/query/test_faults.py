@@ -109,7 +109,7 @@ def test_queries(device, interruption, kind, call):
         return before
 
     steps, _ = interruption.everywhere(make, CALLS[call], check)
-    assert steps > 1 or (call == "set_pairs" and kind in ("found", "manifolds"))
+    assert steps >= 1 or (call == "set_pairs" and kind in ("found", "manifolds"))
 
 
 FRAMES = {
@@ -141,7 +141,7 @@ def test_frames(device, interruption, kind, replayed):
             frame.check()
         return True
 
-    assert interruption.everywhere(make, lambda made: made[0].launch(), check)[0] > 2
+    assert interruption.everywhere(make, lambda made: made[0].launch(), check)[0] >= 2
 
 
 def test_no_mark_is_left(device, interruption):
