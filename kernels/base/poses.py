@@ -20,6 +20,8 @@ UNIT_32 = wp.constant(wp.float64(2.0**-24))
 # Between these sizes of models float32 neither overflows nor loses digits to underflow.
 REACH_MIN = wp.constant(wp.float64(2.0**-100))
 REACH_MAX = wp.constant(wp.float64(2.0**100))
+# Objects farther apart are not compared in float32, whose greatest number is hardly more than what is added up of this.
+FAR_MAX = wp.constant(wp.float64(2.0**125))
 # Some ten float64 roundings; this is 32 of them.
 ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
 # Of what brings small sizes to about 1.
@@ -213,7 +215,11 @@ def pair_pose(whole: bool, trees: Trees, a: wp.int32, b: wp.int32, within: wp.fl
     limit = wp.float64(2.0) * (reach_a + wp.float64(2.0) * reach_b) + margin64
     wide = limit + within
     near = wp.abs(shift[0]) <= wide and wp.abs(shift[1]) <= wide and wp.abs(shift[2]) <= wide
-    if near and limit < wp.float64(wp.inf):
+    if near and far > FAR_MAX:
+        # Within a distance as long: nothing in float32 tells them apart.
+        pose.error = wp.inf
+        pose.margin = wp.inf
+    elif near and limit < wp.float64(wp.inf):
         pose.translation32 = wp.vec3(shift)
         for i in range(3):
             pose.back32[i] = -wp.float32(sum_products(r[0, i], shift[0], r[1, i], shift[1], r[2, i], shift[2]))

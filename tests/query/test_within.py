@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+import trimesh
 from helpers import refused
 from helpers.questions import captured, far_cases, in_a_row, pairs_of, parted_cases, scene_of
 from helpers.samples import STILL, contact_poses, sample
@@ -116,6 +117,20 @@ def test_far_pairs_and_huge_distances(device, far):
         assert not result.any.any()
     scene = in_a_row(device, "box", (1.7e308, -1.7e308))
     assert scene.intersect([(0, 1)], within=1e300).apart[0] and not scene.intersect([(0, 1)], within=1.7e308).any[0]
+
+
+@pytest.mark.parametrize("far", [1.6e38, 1.72e38, 3.5e38, 1e40, 1e300])
+@pytest.mark.parametrize("warps", [False, True])
+def test_all_faces_are_within_a_huge_gap(device, warps, far):
+    """Slabs and boxes of float32, too, where the objects are farther apart than its numbers go."""
+    if device.startswith("cuda") and not warps:
+        pytest.skip("threads take pairs on the CPU alone")
+    ring = ab.Model.load(trimesh.creation.torus(1.0, 0.3, 10, 6))
+    with testing.regime(warps=warps, warps_per_pair=1):
+        scene = ab.Scene(device)
+        scene.add_many([ring, ring], [STILL, (far, -far, 0.3 * far, 0, 0, 0, 1)])
+        for gap, found in ((0.9 * far, 0), (4 * far, ring.face_count**2)):
+            assert len(scene.intersect([(0, 1)], "contacts", gap=gap).faces) == found
 
 
 @pytest.mark.slow
