@@ -82,8 +82,8 @@ def hit_policy(mode: int, for_any: bool) -> WarpPolicy:
         return test_straddling(asked, wp.static(mode), own, popped, pair, trees, pose, found)
 
     headers = ("intersect/small_trees.cuh", "triangle/float32_filter.cuh")
-    donates = mode != int(EXACT)
-    return WarpPolicy(headers, for_any, donates, Hits, try_small, separate, test, pair_has_hit, add_pair_tests)
+    within = mode != int(EXACT)
+    return WarpPolicy(headers, for_any, within, Hits, try_small, separate, test, pair_has_hit, add_pair_tests)
 
 
 def warp_traversal(mode: int, for_any: bool):

@@ -25,8 +25,8 @@ COMPONENT_BITS, COMPONENT_SHIFT = wp.constant(0x4B000000), wp.constant(wp.float3
 INVERSE_SQUARE = wp.constant(wp.float32(2.0**-28))
 # Twice eight margins of boxes for a direction of length 2^14.
 MARGINS = wp.constant(wp.float32(2.0**18))
-# Twice a distance along it, and what it is longer by and rounding makes of that; no distance is infinite.
-WITHIN_FACTOR, WITHIN_MAX = wp.constant(wp.float32(1.01 * 2.0**15)), wp.constant(wp.float32(2.0**126))
+# The margin has a distance eight times, too, of which once is enough, with what directions are longer by and rounding.
+WITHIN_FACTOR = wp.constant(wp.float32(2.0**18 - 1.01 * 2.0**15))
 
 
 @wp.struct
@@ -93,7 +93,8 @@ def overlaps_along(
     reach = add_product(wp.abs(rest), size, along.size + margin)
     middle = fuse32(ratio, other.sum, middle)
     reach = fuse32(wp.abs(ratio), other.size, reach)
-    return wp.abs(middle - along.sum) <= reach
+    # True of NaN: of margins that are infinite, as distances are that float32 does not hold.
+    return not wp.abs(middle - along.sum) > reach
 
 
 @wp.func
@@ -112,8 +113,7 @@ def slabs_overlap(trees: Trees, pose: PairPose, item: wp.int64):
     a_there = map_point(wp.transpose(pose.rotation32), zero, a.direction)
     b_there = map_point(pose.rotation32, zero, b.direction)
     ratio = add_product(a.direction, b_there, 0.0) * INVERSE_SQUARE
-    within = wp.min(wp.float32(pose.within), WITHIN_MAX)
-    margin = fuse32(WITHIN_FACTOR, within, MARGINS * (pose.margin - within))
+    margin = fuse32(-WITHIN_FACTOR, wp.float32(pose.within), MARGINS * pose.margin)
     sum_a, size_a = node_a.upper + node_a.lower, node_a.upper - node_a.lower
     sum_b, size_b = node_b.upper + node_b.lower, node_b.upper - node_b.lower
     by_a = overlaps_along(a, b, a_there, pose.translation32, sum_b, size_b, ratio, margin)

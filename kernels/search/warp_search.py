@@ -82,7 +82,8 @@ class WarpPolicy(NamedTuple):
     Attributes:
         headers: Headers that the functions need beside those of the search.
         for_any: Whether one hit ends a pair.
-        always_donates: Whether warps give work away whatever the sizes of trees are.
+        within: Whether faces nearer than a distance are asked for, not only those that meet. Then warps give work away
+            whatever the sizes of trees are.
         found: Struct of what is found.
         try_small: (output, slot, task, count, trees, pose, items, found, work) -> the parts of a pair for the search,
             of a task (pair, part, parts), 0 where the part is done.
@@ -95,7 +96,7 @@ class WarpPolicy(NamedTuple):
 
     headers: tuple[str, ...]
     for_any: bool
-    always_donates: bool
+    within: bool
     found: Any
     try_small: Callable
     separate: Callable
@@ -248,7 +249,7 @@ def items_searcher(policy: WarpPolicy):
 def warp_search(policy: WarpPolicy):
     """Return the kernel that has warps share the object pairs."""
     try_small, search_items, found_type = policy.try_small, items_searcher(policy), policy.found
-    for_any, always_donates = policy.for_any, policy.always_donates
+    for_any, within = policy.for_any, policy.within
     options = native.options(*WARP_HEADERS, *policy.headers) | {"block_dim": WARP_SIZE}
 
     @wp.kernel(module="unique", module_options=options, cuda_max_registers=128)
@@ -262,7 +263,7 @@ def warp_search(policy: WarpPolicy):
     ):
         """Search units of work, each a part of one object pair, and donated items, until there are none."""
         count = wp.min(batch.count[0], batch.poses.shape[0])
-        ended = first_ended(wp.static(always_donates), work_inout.counter)
+        ended = first_ended(wp.static(within), work_inout.counter)
         unit = first_unit(work_inout.counter)
         parts = units_of_pair(ended, count, work_inout)
         pace = set_pace(stack_room, parts, wp.static(for_any))
@@ -281,6 +282,8 @@ def warp_search(policy: WarpPolicy):
             task = wp.vec3i(p, unit - p * parts, parts)
             unit = claim_ahead(ended, unit, units, work_inout)
             pose = batch.poses[p]
+            if not wp.static(within):
+                pose.within = wp.float64(0.0)  # which the compiler then knows
             left = try_small(output, slot, task, count, trees, pose, own.items, found_inout, work_inout)
             if left > 0:
                 task[2] = left
