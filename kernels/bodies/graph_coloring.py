@@ -14,7 +14,7 @@ from warp_abtree.kernels.bodies.bodies import DYNAMIC, Bodies
 wp.set_module_options(native.options("base/lanes.cuh"))
 
 COLOR_COUNT = wp.constant(16)
-"""Number of colors. Pairs without one have the color COLOR_COUNT; those left over are relaxed one after another."""
+"""Number of colors. Pairs without one of their own have the color COLOR_COUNT, and are the last in order."""
 
 INACTIVE = wp.constant(127)
 """Color of pairs that are not solved."""

@@ -76,11 +76,11 @@ class RelaxedPoint:
     normal: wp.vec3  # from the first object to the second
     arm_a: wp.vec3  # from the centre of mass of the first object to where its impulses act
     arm_b: wp.vec3  # from that of the second
-    may: wp.float64  # speed at which it may approach [world units/s], below 0 if it is to separate
+    allowed: wp.float64  # speed at which it may approach [world units/s], below 0 if it is to separate
     velocity: wp.vec3  # of the second object relative to the first where a pass begins
     response: wp.vec3  # velocity that a unit impulse along the normal gives
     mass: wp.float32  # impulse along the normal that a unit of speed along it takes
-    approach: wp.float32  # `may` in the pair's units
+    approach: wp.float32  # `allowed` in the pair's units
     along: wp.float32  # impulse along the normal
     across: wp.vec3  # across it, world frame
     is_deep: wp.bool  # deeper than it rests
@@ -220,7 +220,7 @@ def load_point(
     point.arm_b = wp.vec3((first_b - half) * units.per_length)
     point.response = response_of(own.a, point.arm_a, point.normal) + response_of(own.b, point.arm_b, point.normal)
     point.mass = divide32(1.0, wp.dot(point.normal, point.response))
-    point.may = approach_of(relaxation, own.corrects, slop, room)
+    point.allowed = approach_of(relaxation, own.corrects, slop, room)
     point.is_deep = room < ZERO
     point.is_apart = room > slop
     return point
@@ -245,7 +245,7 @@ def start_point(
     velocity = velocity_at(bodies, pair[1], constraints.arm_b[p, k] - half)
     velocity -= velocity_at(bodies, pair[0], constraints.arm_a[p, k] + half)
     point.velocity = wp.vec3(velocity * units.per_speed)
-    point.approach = wp.float32(point.may * units.per_speed)
+    point.approach = wp.float32(point.allowed * units.per_speed)
     point.along = wp.float32(constraints.impulse[p, k] * per_impulse)
     point.across = wp.vec3(constraints.friction_impulse[p, k] * per_impulse)
     return -wp.dot(manifolds.normal[p, k], velocity)
