@@ -5,8 +5,8 @@
 
 // In a block of one warp.
 template <unsigned COUNT>
-CUDA_CALLABLE wp::vec_t<COUNT, wp::float64> add_lanes_in_order(wp::vec_t<COUNT, wp::float64> sum,
-                                                               wp::vec_t<COUNT, wp::float64> x, wp::int32 count) {
+CUDA_CALLABLE wp::vec_t<COUNT, wp::float64> add_in_order(wp::vec_t<COUNT, wp::float64> sum,
+                                                         wp::vec_t<COUNT, wp::float64> x, wp::int32 count) {
 #if defined(__CUDA_ARCH__)
     // A column a lane, and one more so that rows begin in banks of their own; then a row a lane.
     __shared__ double values[COUNT][33];
@@ -32,12 +32,7 @@ CUDA_CALLABLE wp::vec_t<COUNT, wp::float64> add_lanes_in_order(wp::vec_t<COUNT, 
 #endif
 }
 
-inline CUDA_CALLABLE wp::vec_t<6, wp::float64> add_in_order(wp::vec_t<6, wp::float64> sum, wp::vec_t<6, wp::float64> x,
-                                                            wp::int32 count) {
-    return add_lanes_in_order(sum, x, count);
-}
-
 inline CUDA_CALLABLE wp::vec_t<9, wp::float64> add_nine_in_order(wp::vec_t<9, wp::float64> sum,
                                                                  wp::vec_t<9, wp::float64> x, wp::int32 count) {
-    return add_lanes_in_order(sum, x, count);
+    return add_in_order(sum, x, count);
 }
