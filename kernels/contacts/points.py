@@ -240,7 +240,7 @@ def write_in_order(
 def point_chooser(most: int):
     """Return the kernel that chooses the points of each pair, so many at most, by a block a pair."""
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, launch_bounds=(TWIST_COUNT, 3))
     def choose_point_kernel(
         objects: ObjectPool,
         batch: PairBatch,

@@ -24,6 +24,14 @@ inline CUDA_CALLABLE void group_sync() {
 #endif
 }
 
+inline CUDA_CALLABLE bool group_any(bool flag) {
+#if defined(__CUDA_ARCH__)
+    return __syncthreads_or(flag);
+#else
+    return flag;
+#endif
+}
+
 // The greatest number of a warp, and the item of a lane that has it, the least of several.
 template <class Number>
 CUDA_CALLABLE void find_greatest_of_warp(Number& x, int& item) {

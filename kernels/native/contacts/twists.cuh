@@ -2,8 +2,9 @@
 #pragma once
 #include "builtin.h"
 #include "base/float32.h"
-#include "base/sizes.h"
 #include "base/groups.cuh"
+#include "base/numbers.cuh"
+#include "base/sizes.h"
 
 struct TwistChoice {
     typedef Float32 F;
@@ -28,8 +29,8 @@ struct TwistChoice {
     struct Twists {
         Point linear, angular;
         lanes stop;          // part of the motion that the points chosen allow
-        lanes worst;         // how deep it takes a candidate then
-        integers candidate;  // the first that goes so deep
+        lanes worst;         // how deep it takes a candidate then, or a bound of that
+        integers candidate;  // the first that goes so deep, UNKNOWN beside a bound
     };
     // A candidate: normal, separation; moment of the normal, and its number.
     struct Wrench {
@@ -38,11 +39,14 @@ struct TwistChoice {
     };
     static constexpr float RIM = 0.95f;
     static constexpr int FEW_TWISTS = 8;
-    const wp::vec4* wrenches;
+    static constexpr int UNKNOWN = -1;
+    // More than the rounding of a bound.
+    static constexpr float ROUNDING = 1.0f + 0x1p-20f;
+    const wp::array_t<wp::vec4>& wrenches;
     int first, end;
 
     CUDA_CALLABLE Wrench get(int c) const {
-        const wp::vec4 &n = wrenches[2 * c], &m = wrenches[2 * c + 1];
+        const wp::vec4 n = load_entry(wrenches, 2 * (wp::int64)c), m = load_entry(wrenches, 2 * (wp::int64)c + 1);
         const lanes zero = {};
         return Wrench{{zero + n[0], zero + n[1], zero + n[2]}, {zero + m[0], zero + m[1], zero + m[2]}, zero + n[3]};
     }
@@ -117,12 +121,31 @@ struct TwistChoice {
         t.linear = Point{reach * n[0] / size, reach * n[1] / size, reach * n[2] / size};
         t.angular = Point{t.angular.x / size, t.angular.y / size, t.angular.z / size};
     }
-    // Lets a candidate stop the twists that go against it.
-    CUDA_CALLABLE void block(Twists& t, const Wrench& c) const {
+    // Lets a candidate stop the twists that go against it. What goes a part of its way takes no candidate deeper than
+    // that part of what it did, since none is inside at first.
+    static CUDA_CALLABLE void block(Twists& t, const Wrench& c) {
         const lanes rate = rate_of(t, c), closing = -rate;
         const auto stops = (closing > 0x1p-20f) & (c.separation < t.stop * closing);
-        t.stop = stops ? c.separation / closing : t.stop;
-        find_worst_again(t, stops);
+        const lanes stop = stops ? c.separation / closing : t.stop, bound = t.worst * (stop / t.stop) * ROUNDING;
+        t.worst = stops ? (bound > 0.0f ? bound : lanes{}) : t.worst;
+        t.candidate = stops ? integers{} + UNKNOWN : t.candidate;
+        t.stop = stop;
+    }
+    // Finds the greatest depth of all twists that are known, and the first candidate that one of them takes so deep.
+    static CUDA_CALLABLE void find_deepest(const Twists (&twist)[GROUPS], float& depth, int& at) {
+        depth = -0x1p126f;
+        at = 0x7fffffff;
+        for (int g = 0; g < GROUPS; ++g) {
+            for (int k = 0; k < LANES; ++k) {
+                const float worst = get_lane(twist[g].worst, k);
+                const int candidate = get_lane(twist[g].candidate, k);
+                if (candidate != UNKNOWN && (worst > depth || (worst == depth && candidate < at))) {
+                    depth = worst;
+                    at = candidate;
+                }
+            }
+        }
+        find_greatest(depth, at);
     }
 };
 
@@ -131,7 +154,7 @@ CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec4> wrenches, wp::int
                                          wp::array_t<wp::float32> twists, wp::float32 limit, wp::float32 tolerance,
                                          wp::float32 deep, wp::int32 most, Array chosen) {
     typedef TwistChoice T;
-    const T choice = {wrenches.data, first, end};
+    const T choice = {wrenches, first, end};
     // The nearest candidate, the first of several, which must be among those chosen or about as near as one; and that
     // whose normal is most against its own.
     float nearest = -0x1p126f, reached = 0x1p126f, against = -0x1p126f;
@@ -171,19 +194,19 @@ CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec4> wrenches, wp::int
     }
     int count = 0;
     while (count < most) {
-        float depth = -0x1p126f;
-        int at = first;
+        float depth;
+        int at;
+        T::find_deepest(twist, depth, at);
+        // Of the others those that may be deeper, or as deep.
+        bool found = false;
         for (int g = 0; g < T::GROUPS; ++g) {
-            for (int k = 0; k < T::LANES; ++k) {
-                const float worst = T::get_lane(twist[g].worst, k);
-                const int candidate = T::get_lane(twist[g].candidate, k);
-                if (worst > depth || (worst == depth && candidate < at)) {
-                    depth = worst;
-                    at = candidate;
-                }
-            }
+            const auto open =
+                (twist[g].candidate == T::UNKNOWN) & (twist[g].worst > tolerance) & (twist[g].worst >= depth);
+            found |= T::F::any(open);
+            choice.find_worst_again(twist[g], open);
         }
-        find_greatest(depth, at);
+        if (group_any(found))
+            T::find_deepest(twist, depth, at);
         const bool is_last = count + 1 == most || depth <= tolerance;
         if (is_last && reached > deep)
             at = nearest_at;
