@@ -9,6 +9,8 @@ constexpr float INVERTED_LEAST = 0x1p-126f, INVERTED_MOST = 0x1p125f;
 struct Float32 {
     typedef float lanes;
     typedef bool bits;
+    typedef int integers;
+    static constexpr int LANES = 1;
     struct Point {
         float x, y, z;
     };
@@ -40,6 +42,8 @@ struct Float32 {
     }
     static CUDA_CALLABLE float first(float v) { return v; }
     static CUDA_CALLABLE int first(int v) { return v; }
+    static CUDA_CALLABLE float get_lane(float v, int) { return v; }
+    static CUDA_CALLABLE int get_lane(int v, int) { return v; }
     static CUDA_CALLABLE bool any(bool flag) { return flag; }
     static CUDA_CALLABLE float pick(const float* from, int at) { return from[at]; }
     static CUDA_CALLABLE Point choose(bool which, const Point& a, const Point& b) { return which ? a : b; }
@@ -52,6 +56,8 @@ struct Float32 {
 struct Float32 {
     typedef float lanes __attribute__((vector_size(64)));
     typedef int bits __attribute__((vector_size(64)));
+    typedef bits integers;
+    static constexpr int LANES = 16;
     typedef bool flags __attribute__((ext_vector_type(16)));
     typedef float four __attribute__((vector_size(16)));
     typedef float eight __attribute__((vector_size(32)));
@@ -74,6 +80,8 @@ struct Float32 {
     }
     static float first(const lanes& v) { return v[0]; }
     static int first(const bits& v) { return v[0]; }
+    static float get_lane(const lanes& v, int k) { return v[k]; }
+    static int get_lane(const integers& v, int k) { return v[k]; }
     static bool any(const bits& flags) { return to_mask(flags) != 0; }
     static float pick(const float* from, int at) { return from[at]; }
     static lanes pick(const float* from, const bits& at) {

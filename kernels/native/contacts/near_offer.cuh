@@ -20,13 +20,8 @@ struct NearOffer {
     typedef F::lanes lanes;
     typedef F::bits bits;
     typedef F::Point Point;
-#if defined(__CUDA_ARCH__)
-    typedef int integers;
-#else
-    typedef bits integers;
-#endif
-    struct Scores : SlotScores<lanes, bits, integers> {
-        typedef SlotScores<lanes, bits, integers> Base;
+    struct Scores : SlotScores<lanes, bits, F::integers> {
+        typedef SlotScores<lanes, bits, F::integers> Base;
         bits inside, counts;
         CUDA_CALLABLE Scores() {}
         CUDA_CALLABLE Scores(const Vector& n, const float* directions)

@@ -21,7 +21,7 @@ void simd_offer_faces(const ModelPool& models, const StatePool& states, const Pa
             NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a, pose.corner_b,
                                  pose.rotation32.data, there, scale, items, some);
         const O::Scores scores = O::rate(corners, bounds[0], bounds[1], directions.data);
-        const SlotKeys<O::lanes, O::bits, O::integers> keys(scores, widths[0] + widths[1]);
+        const SlotKeys<O::lanes, O::bits, O::F::integers> keys(scores, widths[0] + widths[1]);
         for (unsigned int left = O::F::to_mask(scores.counts) & ((1u << some) - 1); left != 0; left &= left - 1) {
             const int i = __builtin_ctz(left);
             int slot_count;

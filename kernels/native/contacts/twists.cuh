@@ -10,21 +10,14 @@ struct TwistChoice {
     typedef Float32 F;
     typedef F::lanes lanes;
     typedef F::Point Point;
+    typedef F::integers integers;
 #if defined(__CUDA_ARCH__)
-    typedef int integers;
-    static constexpr int LANES = 1, GROUPS = 1;
+    static constexpr int GROUPS = 1;
     static CUDA_CALLABLE lanes load(const float* from) { return from[threadIdx.x]; }
-    template <class Number>
-    static CUDA_CALLABLE Number get_lane(const Number& v, int) {
-        return v;
-    }
 #else
-    typedef F::bits integers;
     typedef float loose __attribute__((vector_size(64), aligned(4)));
-    static constexpr int LANES = 16, GROUPS = TWIST_COUNT / 16;
+    static constexpr int GROUPS = TWIST_COUNT / F::LANES;
     static lanes load(const float* from) { return *(const loose*)from; }
-    static float get_lane(const lanes& v, int k) { return v[k]; }
-    static int get_lane(const integers& v, int k) { return v[k]; }
 #endif
     struct Twists {
         Point linear, angular;
@@ -44,11 +37,23 @@ struct TwistChoice {
     static constexpr float ROUNDING = 1.0f + 0x1p-20f;
     const wp::array_t<wp::vec4>& wrenches;
     int first, end;
-
     CUDA_CALLABLE Wrench get(int c) const {
         const wp::vec4 n = load_entry(wrenches, 2 * (wp::int64)c), m = load_entry(wrenches, 2 * (wp::int64)c + 1);
         const lanes zero = {};
         return Wrench{{zero + n[0], zero + n[1], zero + n[2]}, {zero + m[0], zero + m[1], zero + m[2]}, zero + n[3]};
+    }
+    // The first of those candidates of which a number is greatest.
+    template <class Value>
+    CUDA_CALLABLE int find_most(const Value& value) const {
+        float most = -0x1p126f;
+        int at = first;
+        for (int k = first + group_lane(); k < end; k += group_size()) {
+            const float x = value(load_entry(wrenches, 2 * (wp::int64)k));
+            at = x > most ? k : at;
+            most = x > most ? x : most;
+        }
+        find_greatest(most, at);
+        return at;
     }
     static CUDA_CALLABLE lanes rate_of(const Twists& t, const Wrench& c) {
         return F::dot(t.linear, c.normal) + F::dot(t.angular, c.moment);
@@ -89,20 +94,15 @@ struct TwistChoice {
             find_worst(t);
     }
 #endif
-    // Turns about a line across a normal, at the rim of the candidates in a direction: what only the outermost of them
-    // stop. The first two components of a twist are the direction's, along two vectors across the normal.
-    CUDA_CALLABLE void tilt(Twists& t, const float (&n)[3]) const {
-        const int least =
-            fabsf(n[0]) <= fabsf(n[1]) ? (fabsf(n[0]) <= fabsf(n[2]) ? 0 : 2) : (fabsf(n[1]) <= fabsf(n[2]) ? 1 : 2);
-        float u[3] = {least == 0   ? 0.0f
-                      : least == 1 ? -n[2]
-                                   : n[1],
-                      least == 0   ? n[2]
-                      : least == 1 ? 0.0f
-                                   : -n[0],
-                      least == 0   ? -n[1]
-                      : least == 1 ? n[0]
-                                   : 0.0f};
+    // Turns about a line across a candidate's normal, at the rim of the candidates in a direction: what only the
+    // outermost of them stop. The first two components of a twist are the direction's, along two vectors across the
+    // normal.
+    CUDA_CALLABLE void tilt(Twists& t, int candidate) const {
+        const wp::vec4 n = load_entry(wrenches, 2 * (wp::int64)candidate);
+        const float x = fabsf(n[0]), y = fabsf(n[1]), z = fabsf(n[2]);
+        const bool of_x = x <= y && x <= z, of_y = !of_x && y < x && y <= z;
+        const float e[3] = {of_x ? 1.0f : 0.0f, of_y ? 1.0f : 0.0f, of_x || of_y ? 0.0f : 1.0f};
+        float u[3] = {n[1] * e[2] - n[2] * e[1], n[2] * e[0] - n[0] * e[2], n[0] * e[1] - n[1] * e[0]};
         const float length = sqrtf(u[0] * u[0] + u[1] * u[1] + u[2] * u[2]);
         for (int k = 0; k < 3; ++k)
             u[k] = length > 0.0f ? u[k] / length : 0.0f;
@@ -110,12 +110,9 @@ struct TwistChoice {
         // Across the direction: n x (c u + s v) = c v - s u.
         const lanes c = t.linear.x, s = t.linear.y, zero = {};
         t.angular = Point{c * v[0] - s * u[0], c * v[1] - s * u[1], c * v[2] - s * u[2]};
-        t.linear = Point{zero, zero, zero};
         lanes reach = zero;
-        for (int k = first; k < end; ++k) {
-            const lanes out = -rate_of(t, get(k));
-            reach = out > reach ? out : reach;
-        }
+        for (int k = first; k < end; ++k)
+            reach = F::most(reach, -F::dot(t.angular, get(k).moment));
         reach = reach * RIM;
         const lanes size = F::root(F::fuse(reach, reach, zero + 1.0f));
         t.linear = Point{reach * n[0] / size, reach * n[1] / size, reach * n[2] / size};
@@ -136,9 +133,9 @@ struct TwistChoice {
         depth = -0x1p126f;
         at = 0x7fffffff;
         for (int g = 0; g < GROUPS; ++g) {
-            for (int k = 0; k < LANES; ++k) {
-                const float worst = get_lane(twist[g].worst, k);
-                const int candidate = get_lane(twist[g].candidate, k);
+            for (int k = 0; k < F::LANES; ++k) {
+                const float worst = F::get_lane(twist[g].worst, k);
+                const int candidate = F::get_lane(twist[g].candidate, k);
                 if (candidate != UNKNOWN && (worst > depth || (worst == depth && candidate < at))) {
                     depth = worst;
                     at = candidate;
@@ -155,41 +152,22 @@ CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec4> wrenches, wp::int
                                          wp::float32 deep, wp::int32 most, Array chosen) {
     typedef TwistChoice T;
     const T choice = {wrenches, first, end};
-    // The nearest candidate, the first of several, which must be among those chosen or about as near as one; and that
-    // whose normal is most against its own.
-    float nearest = -0x1p126f, reached = 0x1p126f, against = -0x1p126f;
-    int nearest_at = first, against_at = first;
-    for (int k = first + group_lane(); k < end; k += group_size())
-        if (-wrenches.data[2 * k][3] > nearest) {
-            nearest = -wrenches.data[2 * k][3];
-            nearest_at = k;
-        }
-    find_greatest(nearest, nearest_at);
-    const wp::vec4& own = wrenches.data[2 * nearest_at];
-    for (int k = first + group_lane(); k < end; k += group_size()) {
-        const wp::vec4& n = wrenches.data[2 * k];
-        const float other = -Float32::fuse(own[0], n[0], Float32::fuse(own[1], n[1], own[2] * n[2]));
-        if (other > against) {
-            against = other;
-            against_at = k;
-        }
-    }
-    find_greatest(against, against_at);
+    // The nearest candidate, which must be among those chosen or about as near as one; and that whose normal is most
+    // against its own.
+    const int nearest_at = choice.find_most([](const wp::vec4& n) { return -n[3]; });
+    const wp::vec4 own = load_entry(wrenches, 2 * (wp::int64)nearest_at);
+    const int against_at = choice.find_most(
+        [&](const wp::vec4& n) { return -Float32::fuse(own[0], n[0], Float32::fuse(own[1], n[1], own[2] * n[2])); });
+    float reached = 0x1p126f;
     T::Twists twist[T::GROUPS];
-    const T::lanes zero = {};
     for (int g = 0; g < T::GROUPS; ++g) {
-        const int number = T::LANES == 1 ? group_lane() : T::LANES * g;
+        const int number = group_lane() + T::F::LANES * g;
         T::lanes x[6];
         for (int k = 0; k < 6; ++k)
-            x[k] = T::load(twists.data + TWIST_COUNT * k + T::LANES * g);
-        twist[g].linear = T::Point{x[0], x[1], x[2]};
-        twist[g].angular = T::Point{x[3], x[4], x[5]};
-        if (number >= RANDOM_TWISTS) {
-            const int turns = RANDOM_TWISTS + (TWIST_COUNT - RANDOM_TWISTS) / 2;
-            const wp::vec4& n = wrenches.data[2 * (number < turns ? nearest_at : against_at)];
-            choice.tilt(twist[g], {n[0], n[1], n[2]});
-        }
-        twist[g].stop = zero + limit;
+            x[k] = T::load(twists.data + TWIST_COUNT * k + T::F::LANES * g);
+        twist[g] = T::Twists{{x[0], x[1], x[2]}, {x[3], x[4], x[5]}, T::lanes{} + limit};
+        if (number >= RANDOM_TWISTS)
+            choice.tilt(twist[g], number < (RANDOM_TWISTS + TWIST_COUNT) / 2 ? nearest_at : against_at);
         choice.find_worst(twist[g]);
     }
     int count = 0;
@@ -213,9 +191,8 @@ CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec4> wrenches, wp::int
         else if (depth <= tolerance)
             break;
         chosen.data[count++] = at;
-        const float separation = wrenches.data[2 * at][3];
-        reached = separation < reached ? separation : reached;
         const T::Wrench c = choice.get(at);
+        reached = wp::min(reached, T::F::first(c.separation));
         for (int g = 0; g < T::GROUPS; ++g)
             choice.block(twist[g], c);
     }
