@@ -26,7 +26,7 @@ from helpers.samples import STILL
 from helpers.scenes import scene_with
 
 import warp_abtree as ab
-from warp_abtree.interop.robot import link_query, robot
+from warp_abtree.interop.robot import check, robot
 from warp_abtree.interop.robot.description import Description, RobotFrame
 
 
@@ -119,7 +119,7 @@ def test_chunks_and_small_buffers_change_nothing(arm, monkeypatch):
     rows = random_configurations(50, seed=4)
     whole = [arm.check(rows, AROUND, output=output) for output in ("any", "distance")]
     monkeypatch.setattr(robot, "ROOMS", {"cpu": (7,), "cuda": (7,)})
-    monkeypatch.setattr(link_query, "PAIRS_GUESS", 0)
+    monkeypatch.setattr(check, "PAIRS_GUESS", 0)
     for output, expected in zip(("any", "distance"), whole):
         np.testing.assert_array_equal(arm.check(rows, AROUND, output=output), expected)
 
@@ -157,7 +157,7 @@ def test_a_query_is_captured_and_says_when_room_was_short(arm, device, monkeypat
     replay()
     query.check()
     np.testing.assert_array_equal(query.hit.numpy() != 0, expected)
-    monkeypatch.setattr(link_query, "PAIRS_GUESS", 0)
+    monkeypatch.setattr(check, "PAIRS_GUESS", 0)
     short = arm.query(AROUND, output="distance", room=20)
     short.configurations.assign(rows)
     short.launch()

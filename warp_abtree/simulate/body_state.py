@@ -14,7 +14,7 @@ from warp_abtree.kernels.bodies import bodies as kernels
 from warp_abtree.model.model import Model
 from warp_abtree.scene.posed_objects import expect_scene
 from warp_abtree.scene.scene import Scene
-from warp_abtree.state.poses import check_poses, launch_place
+from warp_abtree.state.poses import PoseSetter
 
 SLOP, SLOP_OF_THICKNESS = 2.0**-9, 0.25
 """Penetration that matters little, as a fraction of the bounding radius, and of the thickness at most."""
@@ -154,6 +154,7 @@ class RigidBodies(DeviceMemory):
             getattr(self.bodies, name).assign(values)
         self.targets = ObjectPool()
         self.targets.rotation, self.targets.position = wp.clone(pool.rotation), wp.clone(pool.position)
+        self._target_setter = PoseSetter(self.targets, self.device, scene.batch().removed, "targets")
 
     def _first_reach(self, velocity, angular_velocity, radii):
         """Return how far ahead contacts of the first step are looked for, as if it took FIRST_STEP, (n, 4)."""
@@ -173,11 +174,7 @@ class RigidBodies(DeviceMemory):
 
     def set_targets(self, targets):
         """Set the poses of kinematic objects at the end of the next step; see `Dynamics.step`."""
-        targets = check_poses(targets, "targets", removed=self.scene.batch().removed)
-        if len(targets) != len(self.mass):
-            raise ValueError(f"targets: {len(targets)} given for {len(self.mass)} objects")
-        rows = wp.array(targets.reshape(len(targets), -1), dtype=wp.float64, device=self.device)
-        launch_place(rows, self.targets)
+        self._target_setter.set(targets)
 
     def _frames(self):
         """Return the rotation matrices of the body frames, (n, 3, 3). Waits for the device."""

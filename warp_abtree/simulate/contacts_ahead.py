@@ -11,12 +11,7 @@ from warp_abtree.query.stages.intersect import GapStage, IntersectStage
 
 
 class AheadGapStage(GapStage):
-    """Gaps as wide as bodies move in a step, cut to a little over the distance of a pair where that is less.
-
-    Args:
-        scene: `Scene` of the bodies.
-        bodies: `kernels.bodies.bodies.Bodies` of all objects; its `reach` is the widest gap.
-    """
+    """Gaps as wide as bodies move in a step, their `reach`, cut to a little over the distance of nearer pairs."""
 
     def __init__(self, scene, bodies):
         super().__init__(bodies.reach)

@@ -19,15 +19,7 @@ ROUNDS = [int(mode) for mode, times in zip(ROUND_MODES, (5, 4, 3, 1)) for _ in r
 
 
 class MotionRounds(FirstContactStage):
-    """Cut the motions of objects in rounds, from goals on, until no pair that was apart meets.
-
-    Args:
-        bodies: As for `CertifiedMotions`.
-
-    Attributes:
-        goals: As of `CertifiedMotions`.
-        state: `kernels.StepMotions`.
-    """
+    """Cut the motions of objects in rounds, from goals on, until no pair that was apart meets."""
 
     def __init__(self, bodies):
         super().__init__(float(kernels.TIME_TOLERANCE))

@@ -27,7 +27,6 @@ from warp_abtree.scene.posed_objects import expect_scene
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.budget_report import summarise_rows
 from warp_abtree.simulate.frame_file import FrameFile
-from warp_abtree.simulate.frame_graphs import FrameGraphs
 from warp_abtree.simulate.frame_row import ROW_FIELDS, FrameRow, LodTracker
 from warp_abtree.simulate.frame_stages import FrameStages
 from warp_abtree.simulate.rigid_bodies import SteppedMotion
@@ -56,19 +55,12 @@ def load_update_kernels(scene: Scene):
 
 @dataclass
 class OpenFrame:
-    """A frame from its start until its row is appended: where it is interrupted, it is finished from this.
+    """A frame from its start until its row is appended: where it is interrupted, it is finished from this."""
 
-    Attributes:
-        time: Time in the scene [s].
-        rests: Whether all LODs are known to stay, so that none are selected.
-        changes: `LodUpdate` of LODs that a function of time has changed, else None.
-        is_short: Whether its buffers were too small, and it is launched again.
-    """
-
-    time: float
-    rests: bool = False
-    changes: Any = None
-    is_short: bool = False
+    time: float  # in the scene [s]
+    rests: bool = False  # whether all LODs are known to stay, so that none are selected
+    changes: Any = None  # `LodUpdate` of LODs that a function of time has changed
+    is_short: bool = False  # whether its buffers were too small, and it is launched again
 
     @property
     def refitted(self) -> int:
@@ -145,7 +137,6 @@ class Frame(DeviceMemory):
         self._feedback = Feedback(0.0)
         self._lods = LodTracker(scene)
         self._stages: Any = None
-        self._graphs = FrameGraphs(self._timer)
         self._open: OpenFrame | None = None
 
     def warm_up(self):
@@ -180,8 +171,8 @@ class Frame(DeviceMemory):
         asked = self.scene, self.motion, self.lods if isinstance(self.lods, Controller) else None, self.output
         if self._stages is None or not self._stages.serves(*asked):
             check_motion(self.motion, self.scene)
-            self._open, self._graphs = None, FrameGraphs(self._timer)
-            self._stages = FrameStages(*asked, self.time_step, self._timer.mark)
+            self._open = None
+            self._stages = FrameStages(*asked, self.time_step, self._timer)
             self._lods.restart(self.scene)
         return self._stages
 
@@ -200,7 +191,7 @@ class Frame(DeviceMemory):
             launch(stages.respond)
             if captures:
                 timer.mark("move_ms")
-                graph = self._graphs.find((frame.rests, places), stages.arrays(), launches)
+                graph = stages.find_graph((frame.rests, places), launches)
                 self._open = frame
                 wp.capture_launch(graph)
                 timer.mark("answer_ms" if timer.uses_events else "query_ms")

@@ -75,12 +75,7 @@ ROW_FIELDS = tuple(field.name for field in fields(FrameRow))
 
 
 class LodColumns:
-    """Columns of a `FrameRow` about LODs.
-
-    Args:
-        scene: `Scene` of the objects.
-        level_model, level_lod: Model and LOD of each level at which objects may stand, in this order, int arrays.
-    """
+    """Columns of a `FrameRow` about LODs: of levels at which objects may stand, a model and an LOD each, int arrays."""
 
     def __init__(self, scene, level_model, level_lod):
         self.lod, level_model = np.asarray(level_lod), np.asarray(level_model)
@@ -107,13 +102,9 @@ class LodColumns:
 
 
 class LodTracker:
-    """LODs of the objects of a scene from frame to frame, as the host knows them.
+    """LODs of the objects of a scene from frame to frame, as the host knows them."""
 
-    Attributes:
-        columns: Columns of a `FrameRow` about the LODs last measured.
-    """
-
-    columns: dict[str, Any]
+    columns: dict[str, Any]  # of a `FrameRow`, about the LODs last measured
 
     def __init__(self, scene):
         self._direction = np.zeros(0, np.int8)

@@ -15,6 +15,7 @@ from warp_abtree.kernels.lod.ladder import WARP
 from warp_abtree.kernels.lod.prediction import LevelChoice
 from warp_abtree.kernels.update.levels import Levels
 from warp_abtree.lod.controllers import Controller
+from warp_abtree.lod.timing import Timer
 from warp_abtree.query.stages.contacts import ContactQuery
 from warp_abtree.query.stages.intersect import Query
 from warp_abtree.scene.scene import Scene
@@ -34,11 +35,7 @@ WORDS = (
 class FrameStages:
     """Selection, LOD update, poses, broad and narrow phase, and the response of rigid bodies: launches, in this order.
 
-    Args:
-        motion: As for `Frame`.
-        controller: `Controller` that selects LODs, or None.
-        output: Output of the query where no rigid bodies ask for contacts.
-        mark: Called as mark(stage, count) when the launches of a stage are over; count() returns its counted work.
+    The output is that of the query where no rigid bodies ask for contacts.
 
     Attributes:
         grow, result: Functions of the query, to find with room for all, and to read it; both wait for the device.
@@ -48,11 +45,13 @@ class FrameStages:
     """
 
     def __init__(
-        self, scene: Scene, motion: Any, controller: Controller | None, output: str, time_step: float, mark: Callable
+        self, scene: Scene, motion: Any, controller: Controller | None, output: str, time_step: float, timer: Timer
     ):
         self.scene, self.batch, self.device = scene, scene.batch(), scene.device
         self.motion, self.controller, self._output, self._time_step = motion, controller, output, time_step
-        self._mark, self.seen = mark, 0
+        self._timer, self._mark, self.seen = timer, timer.mark, 0
+        self._graphs: dict[tuple, tuple] = {}  # and the marks that each makes
+        self._graph_arrays: tuple = ()
         self._stepped = motion if isinstance(motion, SteppedMotion) else None
         self.answer, self._find_poses = getattr(motion, "answer", None), getattr(motion, "poses", None)
         self._memory = np.empty((scene.object_count, 7))
@@ -114,9 +113,22 @@ class FrameStages:
             self._levels.load()
         self.grow()
 
-    def arrays(self) -> tuple:
-        """Return a token of all arrays that launches are given: while it stands, a graph of them holds."""
-        return tuple(guard.given() for guard in self._guards)
+    def find_graph(self, key: tuple, launches: list[Callable]) -> wp.Graph:
+        """Return the graph of what a key stands for, captured once for the arrays in use; its marks are made."""
+        arrays, marks = tuple(guard.given() for guard in self._guards), self._timer.marks
+        if arrays != self._graph_arrays:
+            self._graphs.clear()
+            self._graph_arrays = arrays
+        if key in self._graphs:
+            graph, made = self._graphs[key]
+            marks += made
+            return graph
+        before = len(marks)
+        with wp.ScopedCapture(self.device) as capture:
+            for launch in launches:
+                launch()
+        self._graphs[key] = capture.graph, marks[before:]
+        return capture.graph
 
     def bring_poses(self, time: float) -> bool:
         """Bring to the device the poses of a frame that begins at a time [s]; return whether there are any to set."""

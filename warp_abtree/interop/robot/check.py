@@ -1,12 +1,25 @@
 """`RobotQuery`: a chunk of configurations as an operator; and edges, halved until each stretch is decided."""
 
+from itertools import product
+from typing import Any
+
 import numpy as np
 import warp as wp
 
-from warp_abtree.interop.robot.link_query import LinkQuery
-from warp_abtree.query.request import CapacityError
+from warp_abtree.checks.device_memory import DeviceMemory
+from warp_abtree.checks.upload import struct_of, zeros_of
+from warp_abtree.interop.robot.link_parts import order_parts, padding_of
+from warp_abtree.interop.robot.surroundings import make_batch
+from warp_abtree.kernels.intersect.broad_phase import PosedBounds, pose_box_kernel
+from warp_abtree.kernels.robot import answers, forward, link_pairs
+from warp_abtree.kernels.robot.link_pairs import ASK_ANY, ASK_DISTANCE, ASK_PADDED, ASK_WITHIN
+from warp_abtree.query.request import Buffers, CapacityError
+from warp_abtree.query.stages.distance import DistanceQuery
+from warp_abtree.query.stages.intersect import Query
 from warp_abtree.scene.sweep import CONTACT_ROWS
 
+PAIRS_GUESS = 2  # of a configuration and stage
+NO_PAIRS = np.zeros((0, 2), np.int32)
 NEAREST_ROWS = np.dtype(
     [("distance", np.float64), ("points", np.float64, (2, 3)), ("faces", np.int32, 2), ("pair", np.int32, 2)]
 )
@@ -16,21 +29,65 @@ EDGES_AT_ONCE = 1024
 STRETCHES_MAX, WIDTH_LEAST = 1024, 2.0**-30
 
 
-class RobotQuery(LinkQuery):
+class RobotQuery(DeviceMemory):
     """A fixed number of configurations as an operator: allocates once, launches many times.
 
     `launch()` only launches, so that a CUDA graph can capture it; `configurations` and the poses of what surrounds the
     robot, as of the last `take_poses`, are read by each launch. Configurations are taken as they are: those that are
     not finite meet nothing.
 
+    A launch poses the parts, writes the pairs of each stage, a part first, and asks them; stages that a configuration
+    needs no more are empty. The output is "any", "distance"; "within", which tells of what does not meet whether it is
+    proved apart by a reach; or "pairs", read by the host after each stage, so that no graph captures it. Parts that are
+    padded meet where they are not proved apart by their paddings, which is asked first; distances are those of the
+    parts as they are.
+
     Attributes:
         configurations: Device float64 (room, n).
         hit: Whether parts of each intersect, device uint8 (room,).
         nearest: Of output "distance", device arrays of `kernels.robot.answers.NearestParts`, else None.
+        around: Objects of the surroundings, which come first in the batch.
+        active: Configurations that are posed, the room by default.
+        demand: Pairs of a stage at most, and face pairs that waited, device int32 (2,).
+        found: Of "pairs", pairs of objects that meet, a part first, arrays (k, 2).
+        most: Of "distance", what is farther apart is infinitely far.
     """
 
     def __init__(self, robot, around, output: str, room: int):
-        super().__init__(robot, around, output, room)
+        self.device, self.output, self.room, self.active = robot.device, output, room, room
+        self.batch, meets = make_batch(around, robot.models, room, robot.device)
+        self.around = len(meets)
+        self.chain = robot.description.make_chain(self.device)
+        padding = padding_of(robot)
+        self.parts, self.stages = order_parts(robot, meets, padding)
+        device, batch, rows = self.device, self.batch, (room, len(self.chain.lower))
+        buffers, is_within = Buffers(pairs=max(1, PAIRS_GUESS * room)), output == "within"
+        self.found, self.most, self.nearest = [], np.inf, None
+        proofs = [ASK_PADDED] * bool(padding.any()) + [ASK_WITHIN] * is_within
+        self._modes = [ASK_DISTANCE] if output == "distance" else proofs or [ASK_ANY]  # of each stage
+        self.query: Any
+        self._reach: str | None  # array of how far each pair matters
+        if output == "distance":
+            self._reach = "beyond"
+            self.query = DistanceQuery(batch, NO_PAIRS, buffers)
+            self.nearest = zeros_of(answers.NearestParts, room, 0, device)
+        else:
+            self._reach = "within" if proofs else None
+            self.query = Query(batch, "any", NO_PAIRS, buffers, within=0.0 if proofs else None)
+        self.frames = zeros_of(forward.Frames, room, len(self.chain.parent), device)
+        spread, near, most = rows if is_within else (0, 0), room * is_within, room * (output == "distance")
+        shapes: dict[str, Any] = {"half": spread, "size": spread, "hit": room, "near": near, "best": most}
+        zeros = {name: np.zeros(shape) for name, shape in shapes.items()}
+        self.chunk = struct_of(link_pairs.Chunk, device, count=[room], **zeros)
+        arrays = {name: getattr(self.chunk, name) for name in link_pairs.Chunk.vars}
+        self._padded = struct_of(link_pairs.Chunk, device, **{**arrays, "near": self.chunk.hit})  # what is near meets
+        self.hit, self.configurations = self.chunk.hit, wp.zeros(rows, dtype=wp.float64, device=device)
+        self.demand = wp.zeros(2, dtype=wp.int32, device=device)
+        corners = {name: wp.zeros(batch.object_count, dtype=wp.vec3, device=device) for name in ("lower", "upper")}
+        self._boxes = struct_of(link_pairs.LinkBoxes, device, **corners)
+        self._bounds, count = struct_of(PosedBounds, device, pair_count=[0], **corners), self.around
+        self._bvh = wp.Bvh(*(corner[:count] for corner in corners.values())) if count else None
+        self._boxes.bvh = wp.uint64(0) if self._bvh is None else self._bvh.id
         self._world, self._models = around, len(robot.models)
         self._world_batch, self._lods = (None, np.zeros(0)) if around is None else (around.batch(), around.lods)
         self._own_names = [robot.link_names[k] for k in robot.model_link]
@@ -54,6 +111,82 @@ class RobotQuery(LinkQuery):
         """Return the names of models of the robot, of what surrounds it now, and of -1."""
         around = [] if self._world_batch is None else self._world_batch.names
         return [*self._own_names, *around, ""]
+
+    def place(self):
+        """Pose the parts of all configurations, and box all objects. Launches only."""
+        device, batch, around, parts = self.device, self.batch, self.around, self.parts.frame
+        inputs = [self.chain, self.configurations, self.frames]
+        wp.launch(forward.forward_kernel, self.active, inputs, device=device)
+        inputs = [around, parts, self.frames, batch.objects.pool]
+        wp.launch(forward.place_part_kernel, (self.active, len(parts)), inputs, device=device)
+        inputs = [batch.trees, self.query.guard.record(), 0.0, None, self._bounds]
+        wp.launch(pose_box_kernel, around + self.active * len(parts), inputs, device=device)
+        if self._bvh is not None:
+            self._bvh.rebuild()
+        self.hit.zero_()
+        self.chunk.near.zero_()
+
+    def launch(self):
+        """Check all configurations. Launches only."""
+        query, around = self.query, self.around
+        query.check_scene()
+        with query.guard.launching(self):
+            self._forget()
+            self.place()
+            distances = None if self._reach is None else query.distances_of(self._reach)
+            for stage, mode in product(self.stages, self._modes):
+                query.pair_count.zero_()
+                inputs = [mode, wp.vec2i(*stage), around, self.chain, self.parts, self.frames]
+                inputs += [self._boxes, self.chunk, query.pair_batch, distances]
+                wp.launch(link_pairs.find_link_pair_kernel, self.active, inputs, device=self.device)
+                query.search()
+                self._note([around, len(self.parts.frame), query.pair_batch], mode)
+
+    def _forget(self):
+        """Forget the answers of the last launch. Launches only."""
+        self.demand.zero_()
+        self.found.clear()
+        if self.nearest is not None:
+            self.chunk.best.fill_(self.most)
+            self.nearest.distance.fill_(np.inf)
+            self.nearest.points.fill_(np.nan)
+            self.nearest.faces.fill_(wp.vec2i(-1, -1))
+            self.nearest.pair.fill_(wp.vec2i(-1, -1))
+
+    def _note(self, found: list, mode: int):
+        """Reduce the answers of a stage's pairs to those of configurations. Launches only, but for "pairs"."""
+        query, nearest, chunk = self.query, self.nearest, self._padded if mode == ASK_PADDED else self.chunk
+        if nearest is None:
+            near = None if query.near is None else query.near.any_hit
+            steps = [(answers.note_hit_kernel, [query.hits, near, chunk, self.demand])]
+        else:
+            nearest.winner.fill_(int(answers.NO_PAIR))
+            steps = [
+                (answers.note_distance_kernel, [query.hits, query.distances, chunk, self.demand]),
+                (answers.find_winner_kernel, [query.distances, chunk, nearest]),
+                (answers.write_nearest_kernel, [query.distances, nearest, chunk]),
+            ]
+        for kernel, inputs in steps:
+            wp.launch(kernel, len(query.pairs), [*found, *inputs], device=self.device)
+        if nearest is not None:
+            query.forget()
+        elif self.output == "pairs":
+            self.hit.zero_()  # later stages are asked, too
+            pairs = query.pairs.numpy()[: query.pair_count.numpy()[0]]
+            for hits in (query.hits, query.near):
+                if hits is not None:
+                    self.found.append(pairs[hits.any_hit.numpy()[: len(pairs)] != 0])
+
+    def make_room(self) -> bool:
+        """Make room for the demand of the last launch; return whether there was too little. Waits for the device."""
+        (pairs, uncertain), rooms, wanted = self.demand.numpy().tolist(), self.query.rooms, {}
+        if pairs > rooms.pairs:
+            wanted["pairs"] = pairs + pairs // 4
+        if 0 < rooms.uncertain < uncertain:
+            wanted["uncertain"] = 2 * uncertain
+        if wanted:
+            self.query.make_room(**wanted)
+        return bool(wanted)
 
     def check(self):
         """Raise where the last launch lost anything, after making room for the next. Waits for the device.

@@ -22,7 +22,7 @@ from warp_abtree.checks.arguments import (
 from warp_abtree.interop.robot.check import RobotQuery, check_edges
 from warp_abtree.interop.robot.description import Description, RobotError, read_pose
 from warp_abtree.interop.robot.files import read_robot
-from warp_abtree.interop.robot.link_query import padding_of, tested_pairs
+from warp_abtree.interop.robot.link_parts import padding_of, tested_pairs
 from warp_abtree.interop.robot.surroundings import STILL, make_surroundings
 from warp_abtree.kernels.robot import forward
 from warp_abtree.model.model import Model
