@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.device_memory import DeviceMemory
+from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.io import newton as kernels
 from warp_abtree.model.model import Model
 from warp_abtree.model.winding import keep_outside
@@ -22,8 +23,8 @@ from warp_abtree.scene.scene import Scene
 
 # Pairs of other shapes that there is room for by default.
 OTHERS_MAX = 2**16
-SETTINGS = ("type", "scale", "margin", "gap", "flags", "collision_group", "world", "body")
-CONTACT_FIELDS = ("shape0", "shape1", "point0", "point1", "offset0", "offset1", "normal", "margin0", "margin1")
+# Names that end those of Newton's arrays: `model.shape_gap` and so on, `contacts.rigid_contact_count` and so on.
+SETTINGS, CONTACT_FIELDS = tuple(kernels.ShapeSettings.vars), tuple(kernels.RigidContacts.vars)
 
 
 def pairs_between(rows, others):
@@ -184,10 +185,8 @@ class NewtonContacts(DeviceMemory):
             self.scene, None, capacity, gap=own, points=points, remember=remember, originals=originals
         )
         self._first = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self._matching, self._written = kernels.Matching(), None
-        self._matching.buffer = wp.zeros(1, dtype=wp.int64, device=self.device)
-        for name in ("written", "generation", "written_generation"):
-            setattr(self._matching, name, wp.zeros(1, dtype=wp.int32, device=self.device))
+        zeros = {name: [0] for name in ("buffer", "written", "generation", "written_generation")}
+        self._matching, self._written = struct_of(kernels.Matching, self.device, **zeros), None
         self._grow()
 
     def _find_models(self, shapes, given):
@@ -221,10 +220,8 @@ class NewtonContacts(DeviceMemory):
 
     def _settings(self, take=lambda array: array):
         """Return what `take` makes of the settings of all shapes."""
-        made = kernels.ShapeSettings()
-        for name in SETTINGS:
-            setattr(made, name, take(getattr(self.model, f"shape_{name}")))
-        return made
+        arrays = {name: take(getattr(self.model, f"shape_{name}")) for name in SETTINGS}
+        return struct_of(kernels.ShapeSettings, self.device, **arrays)
 
     def _refuse_changes(self):
         """Raise where settings are others than they were. Waits for the device."""
@@ -344,10 +341,8 @@ class NewtonContacts(DeviceMemory):
         else:
             self.others.collide(state, contacts)
         wp.copy(self._first, contacts.rigid_contact_count, count=1)
-        rigid = kernels.RigidContacts()
-        rigid.count = contacts.rigid_contact_count
-        for name in CONTACT_FIELDS:
-            setattr(rigid, name, getattr(contacts, f"rigid_contact_{name}"))
+        arrays = {name: getattr(contacts, f"rigid_contact_{name}") for name in CONTACT_FIELDS}
+        rigid = struct_of(kernels.RigidContacts, self.device, **arrays)
         query, room = self.query, len(self._count)
         body_q = self._no_body if state.body_q is None else state.body_q
         inputs = [query.pair_batch, query.manifolds, self._count]

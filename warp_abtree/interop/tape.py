@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, wrap_array
+from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.io.pose_gradients import ObjectPairs, gradient_adder
 from warp_abtree.query.stages.distance import DistanceQuery
 from warp_abtree.query.staging import first_rows
@@ -36,15 +37,9 @@ def pose_rows(poses, query: DistanceQuery) -> wp.array:
 class PosedDistances:
     """Distances of a query's pairs at poses of all objects, which stay there, and what the gradients need.
 
-    Waits for the device. Raises as `pair_distance` of `warp_abtree.interop.torch`; no object has moved then.
-
-    Args:
-        query: `DistanceQuery` that was given its pairs.
-        rows: Poses as `pose_rows` returns them, which have to stay; quaternions of any norm but 0.
-
-    Attributes:
-        distance: Device float64 (p,).
-        gradient: As `Result.gradient`, on the device.
+    Waits for the device. Raises as `pair_distance` of `warp_abtree.interop.torch`; no object has moved then. Rows of
+    poses are those of `pose_rows`, and have to stay; quaternions may have any norm but 0. On the device are `distance`,
+    float64 (p,), and `gradient`, as `Result.gradient`.
     """
 
     def __init__(self, query: DistanceQuery, rows: wp.array):
@@ -83,10 +78,9 @@ def find_object_pairs(query: DistanceQuery) -> ObjectPairs:
     given, found = _pairs_of.get(query, (None, None))
     if given is not query.given:
         objects = query.given.ravel()
-        found = ObjectPairs()
-        entry = np.argsort(objects, kind="stable").astype(np.int32)
-        start = np.searchsorted(objects[entry], np.arange(len(query.batch.objects.state) + 1)).astype(np.int32)
-        found.entry, found.start = (wp.array(a, dtype=wp.int32, device=query.device) for a in (entry, start))
+        entry = np.argsort(objects, kind="stable")
+        start = np.searchsorted(objects[entry], np.arange(len(query.batch.objects.state) + 1))
+        found = struct_of(ObjectPairs, query.device, entry=entry, start=start)
         _pairs_of[query] = query.given, found
     return found
 

@@ -16,11 +16,9 @@ from warp_abtree.scene.posed_objects import expect_scene
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.poses import PoseSetter
 
+# Penetration that matters little, as a fraction of the bounding radius, and of the thickness at most.
 SLOP, SLOP_OF_THICKNESS = 2.0**-9, 0.25
-"""Penetration that matters little, as a fraction of the bounding radius, and of the thickness at most."""
-
-FIRST_STEP = 1 / 60
-"""Length of a step [s] before the first one is known."""
+FIRST_STEP = 1 / 60  # length of a step [s] before the first one is known
 
 
 def object_mask(chosen, count):
@@ -51,8 +49,8 @@ class MassProperties:
     thickness: float  # least extent along a principal axis [units]
 
 
+# What stands for the mass properties of an object that is no rigid body.
 IMMOVABLE = MassProperties(np.inf, np.zeros(3), np.full(3, np.inf), np.eye(3), np.inf, np.inf)
-"""What stands for the mass properties of an object that is no rigid body."""
 
 
 def mass_properties(model: Model) -> MassProperties:

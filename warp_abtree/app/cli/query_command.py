@@ -14,7 +14,7 @@ from warp_abtree.app.toml.scene_file import load_scene
 from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.interop.scenes import is_assembly
 from warp_abtree.model.files.found import MeshError
-from warp_abtree.query.result import RESULT_ARRAYS
+from warp_abtree.query.result import RESULT_ARRAYS, VECTORS
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.poses import IDENTITY_POSE
 
@@ -175,14 +175,12 @@ def record_found(found, path: Path):
         with atomic_write(path) as file:
             np.savez(file, **arrays)
         return
-    header, columns = ["face_a", "face_b"], [found.faces[:, 1:]]
+    columns = {"face_a": found.faces[:, 1], "face_b": found.faces[:, 2]}
     if found.contacts is not None:
-        for name in ("p0", "p1", "normal_a", "normal_b", "normal"):
-            header += [f"{name}_{axis}" for axis in "xyz"]
-            columns.append(found.contacts[name])
-        header.append("coplanar")
-        columns.append(found.contacts["coplanar"].astype(int)[:, None])
+        for name in VECTORS:
+            columns |= {f"{name}_{axis}": found.contacts[name][:, k] for k, axis in enumerate("xyz")}
+        columns["coplanar"] = found.contacts["coplanar"].astype(int)
     with atomic_write(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(header)
-        writer.writerows([entry for part in parts for entry in part] for parts in zip(*(c.tolist() for c in columns)))
+        writer.writerow(columns)
+        writer.writerows(zip(*(values.tolist() for values in columns.values())))

@@ -109,7 +109,7 @@ class SceneRecording:
             self._camera.position, self._camera.wxyz = camera.eye, turn[[3, 0, 1, 2]]
 
     def write(self, path):
-        """Write the page; return how many bytes it has."""
+        """Write the page."""
         self._serializer.insert_sleep(self.seconds)
         speed = self.seconds / (self.stride * self.loaded.time_step)
         slow = f", {speed:.0f} times slower" if speed > 1.5 else ""
@@ -122,4 +122,3 @@ class SceneRecording:
         data = (page[:end] + footer + page[end:]).encode()
         with atomic_write(path) as file:
             file.write(data)
-        return len(data)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
-from warp_abtree.app.render_data import RenderData
+from warp_abtree.app.render_data import LABELS, RenderData
 from warp_abtree.app.styles import BOX_COLOUR, COLOURS, CONTACT_COLOUR, NEAREST_COLOUR, SEE_THROUGH, to_bytes
 
 SINGLE_LIMIT = 24  # objects up to which each has its own mesh; with more, those of a model and LOD are instances of one
@@ -50,7 +50,6 @@ class ViewerScene:
         self._single: dict[int, _Node] = {}
         self._meshes: dict[int, _Node] = {}
         self._layers: dict[str, _Node] = {}
-        self._labels: list[_Node] = []
         # The key of the mesh that each object shows, and of the one that it waits for; -1 is none.
         self._now, self._next = np.full(count, -1, np.int64), np.full(count, -1, np.int64)
 
@@ -73,10 +72,14 @@ class ViewerScene:
         points = np.reshape(() if data.contacts is None else data.contacts, (-1, 3)).astype(np.float32)
         look = {**POINT, "point_size": POINT_SIZE * min(self.cache.diagonals)}
         self._show_layer("/contacts", self.api.add_point_cloud, {"points": points}, look)
-        self._show_labels(data)
+        told = data.labels()
+        for k in range(LABELS):
+            point, text = told[k] if k < len(told) else (None, "")
+            label = {"text": text, "position": point}
+            self._show_layer(f"/distance/{k}", self.api.add_label, label, {"anchor": "center-center"})
 
     def _show_layer(self, name, add, arrays, look):
-        """Show arrays as a node of their own, which `add` makes; where the first is empty, hide it."""
+        """Show arrays, or a text, as a node of their own, which `add` makes; where the first is empty, hide it."""
         node, some = self._layers.get(name), len(next(iter(arrays.values()))) > 0
         if node is None and some:
             self._layers[name] = self._added(add(name, **arrays, **look), **arrays)
@@ -175,18 +178,6 @@ class ViewerScene:
         node = self._added(handle, **sent)
         handle.on_click(lambda event: self.pick(int(node.members[event.instance_index])))
         return node
-
-    def _show_labels(self, data):
-        """Show the least distances in numbers at the middles of their segments."""
-        told = data.labels()
-        for k, (point, text) in enumerate(told):
-            if k == len(self._labels):
-                handle = self.api.add_label(f"/distance/{k}", text=text, position=point, anchor="center-center")
-                self._labels.append(self._added(handle, text=text, position=point))
-            else:
-                self._update(self._labels[k], text=text, position=point, visible=True)
-        for node in self._labels[len(told) :]:
-            self._update(node, visible=False)
 
 
 def _material(data) -> dict:

@@ -9,11 +9,7 @@ from warp_abtree.state.batch import check_pairs
 
 
 def padding_of(robot) -> np.ndarray:
-    """Return the padding of each model of a robot, float64 (m,).
-
-    Raises:
-        TypeError, ValueError: `link_padding` is no dict, names no link, or has a value that is no finite distance.
-    """
+    """Return the padding of each model of a robot, float64 (m,); raise TypeError or ValueError for a bad one."""
     given = robot.link_padding
     if not isinstance(given, dict):
         raise TypeError(f"link_padding: a {type(given).__name__} is no dict of distances by the names of links")

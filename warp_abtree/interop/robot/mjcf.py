@@ -68,7 +68,7 @@ def _joint_values(mujoco, model, path) -> list[tuple[str, float, float]]:
     check_names(names, "joints", path)
     values, leads = [(name, 1.0, 0.0) for name in names], {}
     for j, name in enumerate(names):
-        kind = mujoco.mjtJoint(int(model.jnt_type[j])).name[len("mjJNT_") :].lower()
+        kind = _kind(mujoco.mjtJoint, model.jnt_type[j])
         if kind not in (*MJCF_JOINTS, "free"):
             raise RobotError(f"{path}: joint {name!r} is {kind}; hinge, slide and free ones are supported")
     for e, kind in _equalities(mujoco, model):
@@ -96,6 +96,11 @@ def _joint_values(mujoco, model, path) -> list[tuple[str, float, float]]:
     return values
 
 
+def _kind(enum, number) -> str:
+    """Return what a number of one of MuJoCo's enums stands for: "hinge" for mjJNT_HINGE."""
+    return enum(int(number)).name.partition("_")[2].lower()
+
+
 def _is_off(mujoco, model, *flags) -> bool:
     off = (int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")) for flag in flags)
     return any(int(model.opt.disableflags) & bit for bit in off)
@@ -105,7 +110,7 @@ def _equalities(mujoco, model):
     """Yield index and kind of each equality that MuJoCo enforces from the start."""
     for e in range(0 if _is_off(mujoco, model, "EQUALITY", "CONSTRAINT") else model.neq):
         if model.eq_active0[e]:
-            yield e, mujoco.mjtEq(int(model.eq_type[e])).name[len("mjEQ_") :].lower()
+            yield e, _kind(mujoco.mjtEq, model.eq_type[e])
 
 
 def _warn_of_closures(mujoco, model, path):
@@ -118,7 +123,7 @@ def _warn_of_closures(mujoco, model, path):
         if kind != "joint":
             of = mujoco.mjtObj.mjOBJ_TENDON if kind == "tendon" else mujoco.mjtObj(int(model.eq_objtype[e]))
             ends = [int(k) for k in (model.eq_obj1id[e], model.eq_obj2id[e]) if k >= 0]
-            unnamed = of.name[len("mjOBJ_") :].lower()
+            unnamed = _kind(mujoco.mjtObj, of)
             tied = " and ".join(repr(mujoco.mj_id2name(model, of, k) or f"{unnamed} {k}") for k in ends)
             name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_EQUALITY, e)
             found.append(f"equality {kind} {name or e!r} of {tied}")
@@ -151,7 +156,7 @@ def _add_body(mujoco, model, b, description, names, values, path) -> int:
         origin = origin @ _pose(model.jnt_pos[j] - anchor)
         anchor = model.jnt_pos[j]
         start = float(model.qpos0[model.jnt_qposadr[j]])
-        kind = MJCF_JOINTS[mujoco.mjtJoint(int(model.jnt_type[j])).name[len("mjJNT_") :].lower()]
+        kind = MJCF_JOINTS[_kind(mujoco.mjtJoint, model.jnt_type[j])]
         axis = unit_axis(model.jnt_axis[j], f"{path}: joint {j}")
         frame = RobotFrame(parent, origin, kind, axis, joint or None, scale, offset - start)
         description.frames.append(frame)
@@ -191,7 +196,7 @@ def _shape(mujoco, model, g, where):
     """Return vertices and faces of a geom, in its own frame."""
     import trimesh
 
-    kind, size = mujoco.mjtGeom(int(model.geom_type[g])).name[len("mjGEOM_") :].lower(), model.geom_size[g]
+    kind, size = _kind(mujoco.mjtGeom, model.geom_type[g]), model.geom_size[g]
     if kind == "mesh":
         m = int(model.geom_dataid[g])
         vertex, face = int(model.mesh_vertadr[m]), int(model.mesh_faceadr[m])

@@ -19,6 +19,7 @@ from warp_abtree.checks.arguments import (
     whole_number,
     wrap_array,
 )
+from warp_abtree.checks.upload import zeros_of
 from warp_abtree.interop.robot.check import RobotQuery, check_edges
 from warp_abtree.interop.robot.description import Description, RobotError, read_pose
 from warp_abtree.interop.robot.files import read_robot
@@ -250,9 +251,7 @@ class Robot:
         """
         check_device(self.device, "Robot.forward")
         rows, is_one = self._take(configurations, limits)
-        frames, shape = forward.Frames(), (len(rows), len(self.description.frames))
-        frames.rotation = wp.empty(shape, dtype=wp.mat33d, device=self.device)
-        frames.position = wp.empty(shape, dtype=wp.vec3d, device=self.device)
+        frames = zeros_of(forward.Frames, len(rows), len(self.description.frames), self.device)
         poses = wp.empty((len(rows), len(self._links)), dtype=wp.mat44d, device=self.device)
         if len(rows):
             wp.launch(forward.forward_kernel, len(rows), [self._chain, rows, frames], device=self.device)
@@ -376,8 +375,7 @@ class Robot:
     def _find_query(self, world, output, count) -> RobotQuery:
         """Return a query of a room for a number of configurations: the one of before if it is of the same."""
         around, key = make_surroundings(world, self.device)
-        key = (*key, tested_pairs(self).tobytes(), tuple(self.mounted))
-        key += (padding_of(self).tobytes(),)
+        key = (*key, tested_pairs(self).tobytes(), tuple(self.mounted), padding_of(self).tobytes())
         rooms = ROOMS["cpu" if self.device.is_cpu else "cuda"]
         room = next((room for room in rooms if room >= count), rooms[-1])
         query = self._kept.pop((key, output, room), None)
