@@ -20,6 +20,7 @@ from warp_abtree.model.winding import keep_outside
 from warp_abtree.query.request import CapacityError
 from warp_abtree.query.stages.points import POINTS_MAX, ManifoldQuery
 from warp_abtree.scene.scene import Scene
+from warp_abtree.state.poses import IDENTITY_POSE
 
 # Pairs of other shapes that there is room for by default.
 OTHERS_MAX = 2**16
@@ -161,12 +162,10 @@ class NewtonContacts(DeviceMemory):
             raise ValueError(f"the model has {len(found)} shapes that are meshes and collide, not two")
         self.shapes = found.astype(np.int32)
         self.scene = Scene(str(self.device))
-        still = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(found), 1))
         static, world = model.shape_body.numpy()[found] < 0, model.shape_world.numpy()[found]
         inside = _find_solids(found, solids)
-        self.scene.add_many(
-            self._find_models(found.tolist(), models or {}), still, worlds=world, statics=static, solids=inside
-        )
+        own = self._find_models(found.tolist(), models or {})
+        self.scene.add_many(own, [IDENTITY_POSE] * len(found), worlds=world, statics=static, solids=inside)
         self.scene.filter(_excluded_pairs(model, self.shapes))
         self._pairs_of_others = _other_pairs(model, is_mesh, collide)
         self._has_others = len(self._pairs_of_others) > 0 or model.particle_count > 0
@@ -180,9 +179,9 @@ class NewtonContacts(DeviceMemory):
         self._no_body = wp.empty(0, dtype=wp.transform, device=self.device)
         self._keep_settings()
         self._place(model.body_q)
-        own = wp.array(reach, dtype=wp.vec4d, device=self.device)
+        gap = wp.array(reach, dtype=wp.vec4d, device=self.device)
         self.query = ManifoldQuery(
-            self.scene, None, capacity, gap=own, points=points, remember=remember, originals=originals
+            self.scene, None, capacity, gap=gap, points=points, remember=remember, originals=originals
         )
         self._first = wp.zeros(1, dtype=wp.int32, device=self.device)
         zeros = {name: [0] for name in ("buffer", "written", "generation", "written_generation")}

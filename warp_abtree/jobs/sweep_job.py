@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from warp_abtree.checks.arguments import flag, to_numpy, whole_number
-from warp_abtree.model.model import Model
 from warp_abtree.query.request import check_options
+from warp_abtree.scene.objects import check_models
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep import sweep
 from warp_abtree.state.poses import check_poses
@@ -113,9 +113,7 @@ class SweepJob:
         tolerance=None,
         beyond=None,
     ):
-        for model in (model_a, model_b):
-            if not isinstance(model, Model):
-                raise TypeError(f"model is a {type(model).__name__}, not a Model: Model.load makes one")
+        check_models([model_a, model_b], 2)
         given = {"within": within, "tolerance": tolerance, "beyond": beyond}
         self.options = check_options(JOB_OPTIONS, output, precision, given)
         self.options |= {"solid": True} if flag(solid, "solid") else {}

@@ -1,7 +1,9 @@
 """Continuous collision of a step: motions cut where surfaces that are apart would meet: `CertifiedMotions`."""
 
+import numpy as np
 import warp as wp
 
+from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.bodies import continuous as kernels
 from warp_abtree.query.operator import Operator
@@ -12,7 +14,6 @@ from warp_abtree.query.stages.intersect import IntersectStage
 from warp_abtree.query.stages.motion import FirstContactStage
 from warp_abtree.scene.scene import Scene
 
-INTEGERS = [(name, wp.int32) for name in ("is_changed", "is_held")]
 ROUND_MODES = kernels.CUT, kernels.MATCH, kernels.HOLD_BOTH, kernels.CERTIFY
 # What each round does with the pairs that it does not prove clear.
 ROUNDS = [int(mode) for mode, times in zip(ROUND_MODES, (5, 4, 3, 1)) for _ in range(times)]
@@ -23,17 +24,16 @@ class MotionRounds(FirstContactStage):
 
     def __init__(self, bodies):
         super().__init__(float(kernels.TIME_TOLERANCE))
-        self._bodies, self.goals, self.state = bodies, ObjectPool(), kernels.StepMotions()
+        self._bodies, self.goals = bodies, ObjectPool()
 
     def attach(self, operator: Operator):
         """Take the operator."""
         super().attach(operator)
-        self._pool, n, state = operator.batch.objects.pool, operator.batch.object_count, self.state
+        self._pool, n = operator.batch.objects.pool, operator.batch.object_count
         self.goals.rotation, self.goals.position = wp.clone(self._pool.rotation), wp.clone(self._pool.position)
-        state.goals, state.ends = self.goals, self.ends
-        for name, dtype in (("fraction", wp.float64), ("cut", wp.float64), *INTEGERS):
-            setattr(state, name, wp.zeros(n, dtype=dtype, device=operator.device))
-        state.counter = wp.zeros(3, dtype=wp.int32, device=operator.device)
+        given = {"goals": self.goals, "ends": self.ends, "counter": np.zeros(3)}
+        zeros = {name: np.zeros(n) for name in ("fraction", "cut", "is_changed", "is_held")}
+        self.state = struct_of(kernels.StepMotions, operator.device, **given, **zeros)
 
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return what has an entry a pair or a thread."""

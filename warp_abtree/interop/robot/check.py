@@ -1,4 +1,11 @@
-"""`RobotQuery`: a chunk of configurations as an operator; and edges, halved until each stretch is decided."""
+"""`RobotQuery`: a chunk of configurations as an operator; and edges, halved until each stretch is decided.
+
+A launch poses the parts, writes the pairs of each stage, a part first, and asks them; stages that a configuration needs
+no more are empty. Of outputs beside "any" and "distance", "within" tells of what does not meet whether it is proved
+apart by a reach, and "pairs" is read by the host after each stage, so that no graph captures it. Parts that are padded
+meet where they are not proved apart by their paddings, which is asked first; distances are those of the parts as they
+are.
+"""
 
 from itertools import product
 from typing import Any
@@ -36,33 +43,24 @@ class RobotQuery(DeviceMemory):
     robot, as of the last `take_poses`, are read by each launch. Configurations are taken as they are: those that are
     not finite meet nothing.
 
-    A launch poses the parts, writes the pairs of each stage, a part first, and asks them; stages that a configuration
-    needs no more are empty. The output is "any", "distance"; "within", which tells of what does not meet whether it is
-    proved apart by a reach; or "pairs", read by the host after each stage, so that no graph captures it. Parts that are
-    padded meet where they are not proved apart by their paddings, which is asked first; distances are those of the
-    parts as they are.
-
     Attributes:
         configurations: Device float64 (room, n).
         hit: Whether parts of each intersect, device uint8 (room,).
         nearest: Of output "distance", device arrays of `kernels.robot.answers.NearestParts`, else None.
-        around: Objects of the surroundings, which come first in the batch.
-        active: Configurations that are posed, the room by default.
-        demand: Pairs of a stage at most, and face pairs that waited, device int32 (2,).
-        found: Of "pairs", pairs of objects that meet, a part first, arrays (k, 2).
-        most: Of "distance", what is farther apart is infinitely far.
     """
 
     def __init__(self, robot, around, output: str, room: int):
-        self.device, self.output, self.room, self.active = robot.device, output, room, room
+        self.device, self.output, self.room = robot.device, output, room
+        self.active = room  # configurations that are posed
         self.batch, meets = make_batch(around, robot.models, room, robot.device)
-        self.around = len(meets)
+        self.around = len(meets)  # objects of the surroundings, which come first
         self.chain = robot.description.make_chain(self.device)
         padding = padding_of(robot)
         self.parts, self.stages = order_parts(robot, meets, padding)
         device, batch, rows = self.device, self.batch, (room, len(self.chain.lower))
         buffers, is_within = Buffers(pairs=max(1, PAIRS_GUESS * room)), output == "within"
-        self.found, self.most, self.nearest = [], np.inf, None
+        self.found: list[np.ndarray] = []  # of "pairs", pairs of objects that meet, a part first, (k, 2)
+        self.most, self.nearest = np.inf, None  # of "distance", what is farther apart is infinitely far
         proofs = [ASK_PADDED] * bool(padding.any()) + [ASK_WITHIN] * is_within
         self._modes = [ASK_DISTANCE] if output == "distance" else proofs or [ASK_ANY]  # of each stage
         self.query: Any
@@ -82,7 +80,7 @@ class RobotQuery(DeviceMemory):
         arrays = {name: getattr(self.chunk, name) for name in link_pairs.Chunk.vars}
         self._padded = struct_of(link_pairs.Chunk, device, **{**arrays, "near": self.chunk.hit})  # what is near meets
         self.hit, self.configurations = self.chunk.hit, wp.zeros(rows, dtype=wp.float64, device=device)
-        self.demand = wp.zeros(2, dtype=wp.int32, device=device)
+        self.demand = wp.zeros(2, dtype=wp.int32, device=device)  # pairs of a stage at most, and face pairs that waited
         corners = {name: wp.zeros(batch.object_count, dtype=wp.vec3, device=device) for name in ("lower", "upper")}
         self._boxes = struct_of(link_pairs.LinkBoxes, device, **corners)
         self._bounds, count = struct_of(PosedBounds, device, pair_count=[0], **corners), self.around
