@@ -152,23 +152,16 @@ class ViewerScene:
 
     def _choose_meshes(self, data, objects):
         """Decide which mesh every object shows now, and which it waits for."""
-        wanted = data.keys
+        wanted, now, coming = data.keys[objects], self._now[objects], self._next[objects]
         ready_since = self.clock() - READY_SECONDS
         ready = np.array([key for key, node in self._meshes.items() if node.since <= ready_since], np.int64)
-        outside = np.ones(len(self._now), bool)
-        outside[objects] = False
-        self._now[outside] = self._next[outside] = -1
-        new = ~outside & (self._now < 0)
-        self._now[new] = wanted[new]
-        came = np.isin(self._next, ready)
-        self._now[came] = self._next[came]
-        there = ~outside & np.isin(wanted, ready)
-        self._now[there] = wanted[there]
-        settled = came | (self._now == wanted)
-        self._next[settled] = -1
-        late = ~outside & (self._now != wanted)
-        asks = late & (self._next < 0)
-        self._next[asks] = wanted[asks]
+        came = np.isin(coming, ready)
+        now = np.where(came, coming, np.where(now < 0, wanted, now))
+        now = np.where(np.isin(wanted, ready), wanted, now)
+        late = now != wanted
+        coming = np.where(came | ~late, -1, coming)
+        self._now[:], self._next[:] = -1, -1
+        self._now[objects], self._next[objects] = now, np.where(late & (coming < 0), wanted, coming)
         self.waits = bool(late.any())
 
     def _add_instances(self, key, look) -> _Node:
