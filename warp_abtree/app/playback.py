@@ -18,6 +18,8 @@ from warp_abtree.interop.scenes import is_assembly
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame
 from warp_abtree.simulate.lod_request import LodSweep
+from warp_abtree.simulate.motion import Kinematic
+from warp_abtree.simulate.rigid_bodies import SteppedMotion
 
 OVERLAP = 0.25  # of the smaller extent: by so much a mesh without a pose reaches into the one before
 SWEEP_PERIOD = 8.0  # seconds from the finest LOD of a mesh to its base and back
@@ -27,27 +29,29 @@ OWN_MODE, HOLD_MODE = "scene", "hold"  # LODs as the scene chooses them, and as 
 class Playback:
     """A scene that runs: each step is a frame, timed by stage.
 
-    `view` is its `SceneView` to begin with, `camera` called with a time [s] returns the one that LODs are for, `chosen`
-    are the LODs of all objects, and `mode` of `modes` is how they are chosen.
+    `view` is its `SceneView` to begin with, `begin` returns a `Frame` of the scene at its start, `camera` called with a
+    time [s] returns the one that LODs are for, `chosen` are the LODs of all objects, and `mode` of `modes` is how they
+    are chosen.
     """
 
-    def __init__(self, scene, title, worlds, time_step, view, camera=None, control=None):
+    def __init__(self, scene, title, worlds, time_step, view, begin, camera=None, control=None):
         self.scene, self.title, self.worlds = scene, title, np.asarray(worlds)
-        self.time_step, self.view = time_step, view
+        self.time_step, self.view, self._begin = time_step, view, begin
         self.camera, self.control = camera, control or LodControl()
         self.mode, self._budget = OWN_MODE, None
         self.restart()
 
-    def _begin(self) -> tuple:
-        """Begin anew: return the `Frame`, what chooses its LODs or None, rigid bodies or None, and poses by time."""
-        raise NotImplementedError
-
     def restart(self):
         """Go back to the start, in the same mode."""
-        self._frame, self._own, self._bodies, self._poses_at = self._begin()
+        self._frame = self._begin()
         self.number, self.chosen, self._first = 0, self.scene.lods, self.scene.lods
-        self._poses = self._poses_at(0.0)
+        self._own, self._poses = self._frame.lods, self._find_poses()
         self.choose(self.mode, self._budget)
+
+    def _find_poses(self) -> np.ndarray:
+        """Return the poses of the last snapshot, of rigid bodies those after it."""
+        motion = self._frame.motion
+        return motion.poses(self.time) if isinstance(motion, Kinematic) else self.scene.poses
 
     @property
     def time(self) -> float:
@@ -104,10 +108,11 @@ class Playback:
         """Run the next frame, with output "count", "faces" or "contacts". Waits for the device."""
         self._frame.output = output
         result = self._frame.step()
-        self.chosen, row = self.scene.lods, self._frame.history[-1]
+        self.chosen, row, motion = self.scene.lods, self._frame.history[-1], self._frame.motion
         self.number = row.frame
-        self._poses = self._poses_at(self.time)
-        if self._bodies is not None:
+        if motion is not None:
+            self._poses = self._find_poses()
+        if isinstance(motion, SteppedMotion):
             # The bodies have moved on: the result shown is of their poses now.
             result = self.scene.intersect(output=output)
         return self._snapshot(result, row)
@@ -117,15 +122,8 @@ class ScenePlayback(Playback):
     """A scene file, as `load_scene` returned it."""
 
     def __init__(self, loaded):
-        self.loaded = loaded
         head = loaded.scene, loaded.title, loaded.worlds, loaded.time_step, loaded.picture
-        super().__init__(*head, camera=loaded.camera, control=loaded.control)
-
-    def _begin(self):
-        bodies = self.loaded.make_bodies()
-        frame = self.loaded.frame(bodies=bodies)
-        poses = self.loaded.motion.poses if bodies is None else lambda _: bodies.poses()
-        return frame, frame.lods, bodies, poses
+        super().__init__(*head, loaded.frame, loaded.camera, loaded.control)
 
 
 class StillPlayback(Playback):
@@ -133,19 +131,19 @@ class StillPlayback(Playback):
 
     def __init__(self, scene: Scene, title: str, up="z", sweep=None):
         worlds, view = worlds_of(scene), make_view(up)
-        self._held, self.started, self._sweep = scene.poses, scene.lods, sweep
-        super().__init__(scene, title, worlds, 1 / 30, view)
+        self.started, self._sweep = scene.lods, sweep
+        super().__init__(scene, title, worlds, 1 / 30, view, self._start)
 
     @property
     def moves(self):
         """Whether LODs are swept, or chosen under a budget, or were."""
         return self.number > 0 or (self.mode != HOLD_MODE and (self.mode != OWN_MODE or self._sweep is not None))
 
-    def _begin(self):
+    def _start(self) -> Frame:
         self.scene.set_lods(self.started)
         frame = Frame(self.scene, None, self._sweep, "count", self.time_step)
         frame.warm_up()
-        return frame, self._sweep, None, lambda _: self._held
+        return frame
 
 
 class MeshPlayback(StillPlayback):

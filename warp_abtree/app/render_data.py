@@ -111,7 +111,7 @@ def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Sett
     keys = geometry.mesh_keys(scene, snapshot.lods)
     distinct, repeats = np.unique(keys[shown], return_counts=True)
     meshes = [(*geometry.split_key(key), n) for key, n in zip(distinct.tolist(), repeats.tolist())]
-    pairs = inside[result.pairs].all(axis=1) if len(result.pairs) else np.zeros(0, bool)
+    pairs = inside[result.pairs].all(axis=1)
     chosen, level = settings.selected, settings.tree_level
     nearest, distance = geometry.nearest_points(scene, shown, result) if settings.distances else geometry.NO_SEGMENTS
     return RenderData(

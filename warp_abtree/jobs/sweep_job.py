@@ -12,7 +12,7 @@ from warp_abtree.query.request import check_options
 from warp_abtree.scene.objects import check_models
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep import sweep
-from warp_abtree.state.poses import check_poses
+from warp_abtree.state.poses import IDENTITY_POSE, check_poses
 
 # Poses of a shard, and rows read at a time while a job is checked.
 READ_ROWS = SHARD = 65536
@@ -221,8 +221,7 @@ class SweepRunner:
             room = min(SCENE_POSES, count, max(1, STATE_BYTES // (BYTES_A_FACE * faces)))
             scene = Scene(device)
             for model, lod in zip(self.models, self.fixed):
-                for _ in range(room):
-                    scene.add(model, lod=lod)
+                scene.add_many(model, [IDENTITY_POSE] * room, lods=lod)
             self._scene = scene
         return self._scene.object_count // 2
 

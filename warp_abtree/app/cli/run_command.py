@@ -51,9 +51,8 @@ def run(options, progress):
     # A full collection of what was loaded takes longer than the budget of a frame.
     gc.collect()
     gc.freeze()
-    bodies = loaded.make_bodies()
     controller = loaded.control.asked(options.controller, options.budget).controller
-    frame = loaded.frame(controller=options.controller, budget_ms=options.budget, bodies=bodies)
+    frame = loaded.frame(controller=options.controller, budget_ms=options.budget)
     lods = []
     with contextlib.ExitStack() as stack:
         page = None

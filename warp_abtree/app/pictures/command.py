@@ -42,8 +42,7 @@ def run_picture(options, progress):
     """Draw what the command line names."""
     import_pyvista("picture")
     _check(options)
-    named = {"objects": options.objects, "poses": options.pose, "lod": options.lod}
-    playback = open_playback(options.source, options.device, progress, **named)
+    playback = open_playback(options.source, options.device, progress, options.objects, options.pose, options.lod)
     own = playback.view
     world = own.world if options.world is None else options.world
     up, eye = (own.up, options.eye or own.eye) if options.up is None else (options.up, options.eye)

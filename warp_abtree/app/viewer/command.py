@@ -72,8 +72,7 @@ def run_viewer(options, progress):
     import_viser()
     if options.port is not None or options.host != HOST:
         check_port(options.host, 0 if options.port is None else options.port)
-    named = {"objects": options.objects, "poses": options.pose, "lod": options.lod}
-    playback = open_playback(options.source, options.device, progress, **named)
+    playback = open_playback(options.source, options.device, progress, options.objects, options.pose, options.lod)
     if options.budget is not None:
         playback.choose(
             "scene" if playback.control.controller in ("predictive", "paper") else "predictive", options.budget
