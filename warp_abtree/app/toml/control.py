@@ -9,6 +9,7 @@ from warp_abtree.scene.scene import Scene
 
 _KINDS = {"predictive": PredictiveController, "paper": PaperController, "tolerance": ToleranceController}
 CONTROLLERS = (*_KINDS, "none")
+BUDGET_CONTROLLERS = ("predictive", "paper")  # those that hold one
 
 
 @dataclass(frozen=True)
@@ -26,14 +27,14 @@ class LodControl:
         Raises ValueError for a controller without its budget or tolerance.
         """
         if controller is None:
-            keeps = budget_ms is None or self.controller in ("predictive", "paper")
+            keeps = budget_ms is None or self.controller in BUDGET_CONTROLLERS
             controller = self.controller if keeps else "predictive"
         if controller not in CONTROLLERS:
             raise ValueError(f"controller {controller!r} is none of {', '.join(CONTROLLERS)}")
-        if budget_ms is not None and controller in ("tolerance", "none"):
+        if budget_ms is not None and controller not in BUDGET_CONTROLLERS:
             raise ValueError(f"controller {controller!r} holds no budget")
         made = replace(self, controller=controller, budget_ms=self.budget_ms if budget_ms is None else budget_ms)
-        if controller in ("predictive", "paper") and made.budget_ms is None:
+        if controller in BUDGET_CONTROLLERS and made.budget_ms is None:
             raise ValueError(f"controller {controller!r} needs a budget")
         if controller == "tolerance" and made.tolerance is None:
             raise ValueError("controller 'tolerance' needs lod.tolerance of the scene file")

@@ -8,7 +8,8 @@ import logging
 import socket
 
 from warp_abtree.app.cli.arguments import Parser, milliseconds
-from warp_abtree.app.playback import Playback, StillPlayback, add_playback_arguments, open_playback
+from warp_abtree.app.playback import OWN_MODE, Playback, StillPlayback, add_playback_arguments, open_playback
+from warp_abtree.app.toml.control import BUDGET_CONTROLLERS
 from warp_abtree.app.viewer.guard import refuse_foreign
 from warp_abtree.scene.scene import Scene
 
@@ -74,9 +75,8 @@ def run_viewer(options, progress):
         check_port(options.host, 0 if options.port is None else options.port)
     playback = open_playback(options.source, options.device, progress, options.objects, options.pose, options.lod)
     if options.budget is not None:
-        playback.choose(
-            "scene" if playback.control.controller in ("predictive", "paper") else "predictive", options.budget
-        )
+        has_own = playback.control.controller in BUDGET_CONTROLLERS
+        playback.choose(OWN_MODE if has_own else "predictive", options.budget)
     progress.close()
     gc.collect()
     gc.freeze()

@@ -15,6 +15,7 @@ from warp_abtree.app.cli.report import show_number
 from warp_abtree.app.playback import HOLD_MODE, OWN_MODE
 from warp_abtree.app.render_data import Settings, compose, legend_html, make_legend, objects_of_world
 from warp_abtree.app.styles import STAGE_LABELS
+from warp_abtree.app.toml.control import BUDGET_CONTROLLERS
 from warp_abtree.app.toml.objects import unit
 from warp_abtree.app.viewer.object_panel import ObjectPanel
 from warp_abtree.app.viewer.viewer_scene import ViewerScene, light_scene, place_camera
@@ -34,7 +35,6 @@ MODE_LABELS = {
     "paper": "budget, as in the paper",
     "tolerance": "tolerance",
 }
-BUDGET_MODES = ("predictive", "paper")
 
 
 class Page:
@@ -169,7 +169,7 @@ class Page:
     def _choose(self):
         """Choose LODs in the mode of the panel; the slider is the budget of the modes that hold one."""
         mode = next(mode for mode in self.playback.modes() if MODE_LABELS[mode] == self._mode.value)
-        self.playback.choose(mode, self._budget.value if mode in BUDGET_MODES else None)
+        self.playback.choose(mode, self._budget.value if mode in BUDGET_CONTROLLERS else None)
         self._past = None
 
     def _hold_all(self, percent):
@@ -300,7 +300,7 @@ class Page:
         self._buttons.visible, self._time.visible = playback.moves, len(kept) > 1
         self._time.min, self._time.max = kept[0].number, kept[-1].number
         self._time.value = self.snapshot.number
-        self._budget.disabled = playback.mode not in BUDGET_MODES
+        self._budget.disabled = playback.mode not in BUDGET_CONTROLLERS
         self._level.disabled = self.objects.selected is None
         self.objects.tell(self.snapshot)
         self._legend.content = legend_html(make_legend(playback.scene, [self._data], self.settings.by_lod))
