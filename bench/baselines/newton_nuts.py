@@ -148,18 +148,25 @@ def measure(models, matrices, others, device, repeats):
         made = dict(theirs)
         keep(row, name, partial(Ours, model, models, *given, poses), poses, others, device, made)
         if name in made:
-            row |= check_ours(name, made[name]) | time_one(name, made, device, repeats)
+            row |= measure_ours(name, made, device, repeats)
     return row
 
 
-def time_one(name, made, device, repeats) -> dict:
-    """Return columns of one of ours: times in turn with Newton's, and at rest, and their ratios."""
+def measure_ours(name, made, device, repeats) -> dict:
+    """Return columns of one of ours: faces, nuts that meet their bolts, crossing face pairs; times in turn with
+    Newton's, and at rest, and their ratios. Raise a RuntimeError where contacts differ from what meets."""
+    ours = made[name]
+    found, scene = ours.found.query.result(with_points=False), ours.found.scene
+    meet, crossing = scene.intersect(found.pairs, "any").any.sum(), found.any.sum()
+    if meet != crossing:
+        raise RuntimeError(f"{meet} nuts meet their bolts, {crossing} have faces that cross")
+    row = {f"{name}_faces": ours.faces, f"{name}_meet": meet, f"{name}_crossing": found.count.sum()}
     launches = {key: one.launch for key, one in made.items()}
     times = medians(time_in_turn(launches, device, repeats))
-    made[name].launch()
-    times |= medians(time_in_turn({f"{name}_rest": made[name].rest}, device, repeats))
+    ours.launch()
+    times |= medians(time_in_turn({f"{name}_rest": ours.rest}, device, repeats))
     ratios = {f"{key}_over_{name}": ms / times[name] for key, ms in times.items() if not key.startswith(name)}
-    return {f"{key}_ms": ms for key, ms in times.items()} | ratios
+    return row | {f"{key}_ms": ms for key, ms in times.items()} | ratios
 
 
 def keep(row, name, make, poses, others, device, made):
@@ -184,12 +191,3 @@ def body_poses(matrices):
     poses[:, 6] = 1
     poses[1::2] = [wp.transform(*wp.transform_decompose(wp.mat44(matrix))[:2]) for matrix in matrices]
     return poses
-
-
-def check_ours(name, ours) -> dict:
-    """Return columns: faces, nuts that meet their bolts, crossing face pairs; raise where contacts differ from them."""
-    found, scene = ours.found.query.result(with_points=False), ours.found.scene
-    meet, crossing = scene.intersect(found.pairs, "any").any.sum(), found.any.sum()
-    if meet != crossing:
-        raise RuntimeError(f"{meet} nuts meet their bolts, {crossing} have faces that cross")
-    return {f"{name}_faces": ours.faces, f"{name}_meet": meet, f"{name}_crossing": found.count.sum()}

@@ -20,7 +20,7 @@ from warp_abtree.lod.timing import STAGES
 from warp_abtree.simulate.budget_report import budget_report
 
 from .. import tables
-from ..timing import medians, one_core, summarise
+from ..timing import one_core, summarise
 
 NAMES = ("rain", "focus")
 OBJECTS = {"cpu": {"rain": 300, "focus": 300}, "cuda": {"rain": 4000, "focus": 1500}}
@@ -57,9 +57,10 @@ def run(device, quick=False, plots=None):
             for controller in CONTROLLERS:
                 asked = options if budget is None else options | {"budget_ms": budget}
                 frame = run_controller(loaded, controller, OUTPUT[kind], QUICK_FRAMES if quick else FRAMES, asked)
-                budget = budget or float(np.median(steady_costs(frame))) / BREACH
+                steady = [each for each in frame.history if each.time >= 1.0]
+                budget = budget or middle(steady) / BREACH
                 row = {"scene": name, "objects": loaded.scene.object_count}
-                yield row | {"budget_ms": budget, "controller": controller} | describe_hold(frame, budget)
+                yield (row | {"budget_ms": budget, "controller": controller} | describe_hold(frame, steady, budget))
                 runs[controller] = frame.history
             if plots is not None:
                 draw_runs(name, runs, budget, plots)
@@ -94,19 +95,19 @@ def run_controller(loaded, controller, output, frames, options):
     return frame
 
 
-def steady_costs(frame):
-    """Return T' of all frames after the first second [ms]."""
-    return np.array([row.total_ms for row in frame.history if row.time >= 1.0])
+def middle(rows, stage="total_ms"):
+    """Return the median of a column of frames."""
+    return float(np.median([getattr(row, stage) for row in rows]))
 
 
-def describe_hold(frame, budget):
-    """Return the columns of one run."""
-    found, costs = budget_report(frame.history, budget), steady_costs(frame)
-    rows = [row for row in frame.history if row.time >= 1.0]
+def describe_hold(frame, steady, budget):
+    """Return the columns of one run, some of whose rows are those after the first second."""
+    found = budget_report(frame.history, budget)
     names = ("within", "within_110_percent", "worst", "oscillations", "error_mean")
-    row = {"judged": found["frames"]} | {name: found[name] for name in names} | summarise({"cost": costs})
-    row |= {"error_max": max(row.error_max for row in rows)}
-    return row | {name: round(np.mean([getattr(row, name) for row in rows])) for name in ("faces", "hits")}
+    row = {"judged": found["frames"]} | {name: found[name] for name in names}
+    row |= summarise({"cost": [each.total_ms for each in steady]})
+    row |= {"error_max": max(each.error_max for each in steady)}
+    return row | {name: round(np.mean([getattr(each, name) for each in steady])) for name in ("faces", "hits")}
 
 
 def draw_runs(name, runs, budget, folder):
@@ -125,22 +126,19 @@ def find_stages(loaded, name, frames, options):
     for lods in ("finest", "coarsest"):
         rows = run_settled(loaded, frames, options, coarsest=lods == "coarsest")
         row = {"scene": name, "objects": loaded.scene.object_count, "lods": lods}
-        stages = {stage: [getattr(row, stage) for row in rows] for stage in (*STAGES, "total_ms")}
-        yield row | {"hits": float(np.median([row.hits for row in rows]))} | medians(stages)
+        yield row | {column: middle(rows, column) for column in ("hits", *STAGES, "total_ms")}
 
 
 def compare(loaded, name, frames):
     """Yield a row a budget of one scene."""
     finest = run_settled(loaded, frames, {})
     for part in BUDGETS:
-        budget = part * float(np.median([row.total_ms for row in finest]))
+        budget = part * middle(finest)
         controlled = run_settled(loaded, frames, {"budget_ms": budget}, "predictive")
         finest += run_settled(loaded, frames, {})
-        stand, total = (float(np.median([row.total_ms for row in rows])) for rows in (finest, controlled))
-        stages = medians({stage: [getattr(row, stage) for row in controlled] for stage in STAGES})
-        row = {"scene": name, "objects": loaded.scene.object_count}
-        row |= {"budget": part, "finest_ms": stand, "total_ms": total} | stages
-        yield row | {"error_mean": controlled[-1].error_mean, "ratio": total / stand}
+        row = {"scene": name, "objects": loaded.scene.object_count, "budget": part, "finest_ms": middle(finest)}
+        row |= {column: middle(controlled, column) for column in ("total_ms", *STAGES)}
+        yield row | {"error_mean": controlled[-1].error_mean, "ratio": row["total_ms"] / row["finest_ms"]}
 
 
 def run_settled(loaded, frames, options, controller="none", coarsest=False):

@@ -42,13 +42,6 @@ def count_frame_kernel(time_inout: wp.array(dtype=wp.int32)):
     time_inout[0] = time_inout[0] + 1
 
 
-def grid_poses(count):
-    """Return float64 (count, 7): a cubic grid of objects with any rotation."""
-    side = int(np.ceil(count ** (1 / 3)))
-    place = np.stack(np.unravel_index(np.arange(count), (side, side, side)), 1)
-    return np.concatenate([SPACING * place, random_directions(np.random.default_rng(0), count, 4)], 1)
-
-
 class Frames:
     """A captured frame and the kernels that drive it, one graph; and the same frames from the host.
 
@@ -109,9 +102,12 @@ def run(device, quick=False):
     model = ab.Model.from_arrays(*knot(sizes["faces"]))
     levels = np.unique(np.linspace(model.lod_max // 10, model.lod_max, STEPS).astype(np.int32))
     for count in sizes["objects"]:
+        side = int(np.ceil(count ** (1 / 3)))
+        place = np.stack(np.unravel_index(np.arange(count), (side, side, side)), 1)
+        poses = np.concatenate([SPACING * place, random_directions(np.random.default_rng(0), count, 4)], 1)
         for ladder in (False, True) if device.is_cuda or count <= OBJECTS_MAX_CPU else ():
             gc.collect()  # scenes and their queries hold each other
-            frames = Frames(scene_of_objects(device, model, grid_poses(count)), levels, ladder)
+            frames = Frames(scene_of_objects(device, model, poses), levels, ladder)
             row = {"faces": model.face_count, "objects": count, "ladder": ladder}
             row |= frames.check(sizes["repeats"])
             runs = make_runs({"frame": frames.launch}, device)

@@ -47,10 +47,6 @@ def bound_nodes(k, faces):
     return k * (math.ceil(math.log2(faces)) - math.log2(k) + 2) - 1 if k else 0
 
 
-def same_bits(one, other) -> bool:
-    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
-
-
 def check_update(scene, there, back, faces):
     """Move to other LODs and back by both kinds of refit and compare all bits; return k and nodes refitted of each
     state by the partial update, faces in its slices, and by kind of refit the launches that repeat both updates. Raise
@@ -69,12 +65,12 @@ def check_update(scene, there, back, faces):
             home = testing.repeat_update(scene.set_lods(back))
         if state_lods(scene) != begin:
             raise RuntimeError("states do not return to where they were")
-        if not same_bits(start, read_bits(scene)):
+        if not all(map(np.array_equal, start, read_bits(scene))):
             raise RuntimeError(f"{kind}: the way back leaves other bits than were there before")
         launches[kind] = forth, home
     if not np.array_equal(counts["update"], counts["full"]):
         raise RuntimeError(f"a partial update changes {k.sum()} faces, a full refit {counts['full'].sum()}")
-    if not same_bits(bits["update"], bits["full"]):
+    if not all(map(np.array_equal, bits["update"], bits["full"])):
         raise RuntimeError("a partial update and a full refit leave different bits")
     if any(nodes[i] > bound_nodes(int(k[i]), faces) for i in range(len(k))):
         raise RuntimeError("more nodes refitted than equation (1) allows")

@@ -86,7 +86,13 @@ def run(device, quick=False, only=PARTS):
     clock = host_clock(device)
     with one_core():
         if "any" in only:
-            yield about | run_any(device, clock, robot, around, configurations, sizes)
+            # Beside python-fcl, on some.
+            fcl_robot, some = FclRobot(robot, around), configurations[: sizes["fcl"]]
+            poses, found = robot.forward(some).numpy(), robot.check(configurations, around)
+            ask, ask_fcl = partial(robot.check, configurations, around), partial(fcl_robot.any, poses)
+            row = {"output": "any", "meet": found.mean(), "differ_from_fcl": (ask_fcl() != found[: len(some)]).sum()}
+            row |= time_asked(device, clock, ask, configurations, sizes["repeats"], fcl=ask_fcl)
+            yield about | row | {"fcl_per_s": round(1e3 * len(some) / row["fcl_ms"])}
         if "distance" in only:
             part = configurations[: max(2, count // 8)]
             for beyond in (None, 0.05):
@@ -107,13 +113,3 @@ def time_asked(device, clock, ask, asked, repeats=1, **others):
     runs = {name: time_call(other, clock=clock) for name, other in others.items()}
     row = summarise(time_rounds({"ours": time_call(ask, device, clock)} | runs, repeats))
     return {"asked": len(asked)} | row | {"per_s": round(1e3 * len(asked) / row["ours_ms"])}
-
-
-def run_any(device, clock, robot, around, configurations, sizes):
-    """Return the columns of yes or no, beside python-fcl."""
-    fcl_robot, some = FclRobot(robot, around), configurations[: sizes["fcl"]]
-    poses, found = robot.forward(some).numpy(), robot.check(configurations, around)
-    ask, ask_fcl = partial(robot.check, configurations, around), partial(fcl_robot.any, poses)
-    row = {"output": "any", "meet": found.mean(), "differ_from_fcl": (ask_fcl() != found[: len(some)]).sum()}
-    row |= time_asked(device, clock, ask, configurations, sizes["repeats"], fcl=ask_fcl)
-    return row | {"fcl_per_s": round(1e3 * len(some) / row["fcl_ms"])}

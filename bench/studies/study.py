@@ -98,15 +98,6 @@ def describe_device(device) -> str:
     return device.name if device.is_cuda else f"{platform.processor()}, {os.cpu_count()} cores"
 
 
-def run_part(run, context, command) -> dict:
-    """Run a part; return its rows, notes and the circumstances."""
-    begin = time.perf_counter()
-    rows = [{key: tables.plain(value) for key, value in row.items()} for row in run(context)]
-    about = {"device": describe_device(context.device), "quick": context.quick, **describe_run(), "command": command}
-    about["seconds"] = tables.plain(time.perf_counter() - begin)
-    return {"run": about, "notes": context.notes, "rows": rows}
-
-
 class StudyError(ValueError):
     """What was asked for is not there."""
 
@@ -135,7 +126,11 @@ def run(device, name, out, quick=False, models=None, only=None, command=None):
         study = json.loads(file.read_text(encoding="utf-8"))
     for part in only or parts:
         print(f"{name}: {part}", file=sys.stderr, flush=True)
-        study["parts"][part] = run_part(parts[part], Context(device, quick, folder), command)
+        context, begin = Context(device, quick, folder), time.perf_counter()
+        rows = [{key: tables.plain(value) for key, value in row.items()} for row in parts[part](context)]
+        about = {"device": describe_device(context.device), "quick": quick, **describe_run(), "command": command}
+        about["seconds"] = tables.plain(time.perf_counter() - begin)
+        study["parts"][part] = {"run": about, "notes": context.notes, "rows": rows}
         tables.write_json(file, study)
     (out / f"{name}.md").write_text(tables.study_page(study), encoding="utf-8")
     figures = tables.read_layout(f"studies/{name}.toml")["figure"]

@@ -3,10 +3,9 @@
 import numpy as np
 
 import warp_abtree as ab
-from warp_abtree import testing
 from warp_abtree.testing import upload_lods
 
-from ...cases.update import REFITS, bound_nodes, check_update
+from ...cases.update import bound_nodes, check_update
 from ...tables import pick
 from ...timing import crossover
 from .meshes import PosedPairs, paper_models
@@ -44,13 +43,9 @@ def time_move(context, scene, model, home, there):
     """Return the row of one LOD change, both kinds of refit checked against each other first."""
     scene.set_lods([home])
     k, nodes, entries, launches = check_update(scene, [there], [home], model.face_count)
-    refits = {}
-    for kind, full in REFITS.items():
-        scene.set_lods([home])
-        with testing.force_refits(full):
-            refits[kind] = testing.repeat_update(scene.set_lods([there]))
     # In turn, at the same LOD: a refit repeated alone is one that the processor knows by heart.
-    times = context.time_graphs(refits)
+    scene.set_lods([there])
+    times = context.time_graphs({kind: forth for kind, (forth, _) in launches.items()})
     scene.set_lods([home])
     (forth, back), (between, after) = launches["update"], launches["full"]
     moved = context.time_graphs({"there": forth, "between": between, "back": back, "after": after})

@@ -13,62 +13,54 @@ QUICK_TOLERANCES = (0.05, 0.01)
 CLEAR = 0.5  # length of the mean of a pose's normals from which on they are said to agree
 
 
-class LodLevels:
-    """A workload at one level of detail after another, beside the exact answer."""
-
-    def __init__(self, workload):
-        self.workload = workload
-        self.exact = workload.query(workload.finest, workload.poses, "contacts").run()
-        self.exact.check()
-        if not np.array_equal(self.exact.any, workload.truth):
-            raise RuntimeError("outputs 'any' and 'contacts' differ at the finest LODs")
-        self.regions = make_regions(self.exact.contacts, len(workload.poses), workload.size)
-        self.clear = resultants(self.exact.contacts, len(workload.poses)) > CLEAR
-        self.levels = []
-
-    def measure(self, kind, value, lods):
-        """Add the row of a level, times aside; yield one row a distance from the first contact."""
-        workload, exact = self.workload, self.exact
+def run(context, workload):
+    """Yield one row a level, and one a distance from the first contact."""
+    exact = workload.query(workload.finest, workload.poses, "contacts").run()
+    exact.check()
+    if not np.array_equal(exact.any, workload.truth):
+        raise RuntimeError("outputs 'any' and 'contacts' differ at the finest LODs")
+    regions = make_regions(exact.contacts, len(workload.poses), workload.size)
+    clear = resultants(exact.contacts, len(workload.poses)) > CLEAR
+    settings = [("fraction", value) for value in context.size(FRACTIONS, QUICK_FRACTIONS)]
+    settings += [("tolerance", value) for value in context.size(TOLERANCES, QUICK_TOLERANCES)]
+    levels = []
+    for kind, value in settings:
+        lods = workload.lods(**{kind: value})
         found = workload.query(lods, workload.poses, "contacts").run()
-        error = workload.first_contact(workload.ask_at(lods))
-        bound = workload.bound(lods) / workload.size
         row = {"case": "level", "workload": workload.name, "kind": kind, "value": value}
-        row |= {"share": workload.fraction(lods), "bound": bound}
-        row |= judge_answers(found.any, exact.any) | judge_contact(error)
-        if bound:
-            row["contact_over_bound"] = (np.abs(error) > bound).sum()
-        row |= compare_regions(make_regions(found.contacts, len(workload.poses), workload.size), self.regions)
-        row |= compare_normals(found.pair_contacts, exact.pair_contacts, self.clear)
+        row |= describe_errors(workload, lods, found, exact)
+        row |= compare_regions(make_regions(found.contacts, len(workload.poses), workload.size), regions)
+        row |= compare_normals(found.pair_contacts, exact.pair_contacts, clear)
         row |= {"contacts": len(found.contacts), "contacts_node_tests": found.node_tests.mean()}
         row["node_tests"] = workload.query(lods, workload.poses, "any").run().node_tests.mean()
-        self.levels.append((row, lods))
+        levels.append((row, lods))
         for offset in np.unique(workload.offset) if kind == "fraction" else ():
             at = workload.offset == offset
             about = {"case": "offset", "workload": workload.name, "value": value, "offset": offset}
             yield about | judge_answers(found.any[at], exact.any[at])
-
-    def time(self, context):
-        """Return the rows with their times, taken in turn."""
-        poses, launches, rows = self.workload.repeated(), {}, [row for row, _ in self.levels]
-        for number, (row, lods) in enumerate(self.levels):
-            room = max(1024, row["contacts"] * (len(poses) // len(self.workload.poses)))
-            for output, options in {"any": {}, "contacts": {"capacity": room}}.items():
-                query = self.workload.query(lods, poses, output, **options)
-                query.run().check()
-                launches[number, output] = query.launch
-        for (number, output), milliseconds in context.time_launches(launches).items():
-            rows[number][f"{output}_us"] = 1e3 * milliseconds / len(poses)
-        finest = next(row for row in rows if (row["kind"], row["value"]) == ("fraction", 1))
-        for row in rows:
-            row |= {f"{output}_cost": row[f"{output}_us"] / finest[f"{output}_us"] for output in ("any", "contacts")}
-        return rows
+    yield from time_levels(context, workload, levels)
 
 
-def run(context, workload):
-    """Yield one row a level, and one a distance from the first contact."""
-    levels = LodLevels(workload)
-    for value in context.size(FRACTIONS, QUICK_FRACTIONS):
-        yield from levels.measure("fraction", value, workload.lods(fraction=value))
-    for value in context.size(TOLERANCES, QUICK_TOLERANCES):
-        yield from levels.measure("tolerance", value, workload.lods(tolerance=value))
-    yield from levels.time(context)
+def describe_errors(workload, lods, found, exact) -> dict:
+    """Return columns of a level: the fraction of the faces, wrong answers, and errors of the first contacts."""
+    error, bound = workload.first_contact(workload.ask_at(lods)), workload.bound(lods) / workload.size
+    row = {"share": workload.fraction(lods), "bound": bound}
+    row |= judge_answers(found.any, exact.any) | judge_contact(error)
+    return row | ({"contact_over_bound": (np.abs(error) > bound).sum()} if bound else {})
+
+
+def time_levels(context, workload, levels):
+    """Return the rows of levels (row, LODs) with their times, taken in turn."""
+    poses, launches, rows = workload.repeated(), {}, [row for row, _ in levels]
+    for number, (row, lods) in enumerate(levels):
+        room = max(1024, row["contacts"] * (len(poses) // len(workload.poses)))
+        for output, options in {"any": {}, "contacts": {"capacity": room}}.items():
+            query = workload.query(lods, poses, output, **options)
+            query.run().check()
+            launches[number, output] = query.launch
+    for (number, output), milliseconds in context.time_launches(launches).items():
+        rows[number][f"{output}_us"] = 1e3 * milliseconds / len(poses)
+    finest = next(row for row in rows if (row["kind"], row["value"]) == ("fraction", 1))
+    for row in rows:
+        row |= {f"{output}_cost": row[f"{output}_us"] / finest[f"{output}_us"] for output in ("any", "contacts")}
+    return rows
