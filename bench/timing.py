@@ -44,10 +44,7 @@ def host_clock(device):
 
 
 def time_call(call, device="cpu", clock=time.perf_counter):
-    """Return a callable that calls something, waits for the device and returns the time [ms].
-
-    The clock `time.thread_time` leaves out other threads and processes.
-    """
+    """Return a callable that calls something, waits for the device and returns the time [ms] by a clock [s]."""
 
     def run():
         wp.synchronize_device(device)
@@ -73,8 +70,7 @@ def time_rounds(runs: dict, repeats) -> dict:
 def make_runs(launches: dict, device, clock=time.perf_counter, captured=None) -> dict:
     """Launch each thing once, in order, which compiles it; return callables that run one and return its time [ms].
 
-    Args:
-        captured: Whether launches become graphs; None is on CUDA alone. On the CPU a graph costs no Python a launch.
+    For `captured` see `make_replay`; on the CPU a graph costs no Python a launch.
     """
     runs = {}
     for name, launch in launches.items():

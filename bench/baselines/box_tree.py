@@ -50,10 +50,7 @@ class TreeBaseline:
 
 
 def run(device, quick=False):
-    """Yield a row a number of objects and worlds: ours, which poses the boxes too, and peer, the tree, in turn.
-
-    On a GPU both are graphs. The pairs of both are compared.
-    """
+    """Yield a row a number of objects and worlds: ours, which poses the boxes too, and peer, the tree, in turn."""
     box = ab.Model.load(trimesh.creation.box((1, 1, 1)))
     for count, worlds in QUICK if quick else FULL:
         rng, each = np.random.default_rng(0), count // worlds

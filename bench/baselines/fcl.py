@@ -90,12 +90,8 @@ class Fcl:
 
 
 class FclRobot:
-    """python-fcl, asked what a robot is asked: a BVHModel a link, pair by pair until two intersect.
-
-    Args:
-        robot: `ab.Robot`.
-        around: `ab.Model` of what surrounds it.
-    """
+    """python-fcl, asked what an `ab.Robot` is asked: a BVHModel a link, pair by pair until two intersect, and one of
+    the model of what surrounds it."""
 
     def __init__(self, robot, around):
         import fcl

@@ -20,9 +20,7 @@ CANDIDATES_PER_HIT = 4
 class Pipeline:
     """A `newton.CollisionPipeline` over pairs of shapes that follow one another, with its state and contacts.
 
-    Args:
-        contacts, candidates: How many it has room for, of the latter a million at least.
-        options: More of the pipeline's.
+    It has room for so many contacts, and so many candidates, a million at least.
     """
 
     def __init__(self, model, contacts, candidates, **options):

@@ -90,11 +90,7 @@ def morton_order(points) -> np.ndarray:
 
 
 class FaceBvh:
-    """A wp.Bvh over the faces of a mesh.
-
-    Args:
-        constructor: One of `CONSTRUCTORS`, None for Warp's own choice.
-    """
+    """A wp.Bvh over the faces of a mesh, by one of `CONSTRUCTORS`; None is Warp's own choice."""
 
     def __init__(self, vertices, faces, device, constructor=None):
         self.device = wp.get_device(device)
@@ -118,11 +114,9 @@ class FaceBvh:
 
 
 class BvhPosed(FaceBvh):
-    """All face pairs of posed pairs, or yes or no.
+    """All face pairs of posed pairs, with room for `capacity`; or yes or no, where that is None.
 
-    Args:
-        capacity: Face pairs that there is room for, None asks yes or no.
-        constructor: None takes the one that answers fastest.
+    Without a constructor it takes the one that answers fastest.
     """
 
     def __init__(self, vertices, faces, poses, capacity, device, constructor=None):

@@ -41,7 +41,7 @@ def run(device, quick=False, plots=None):
     """Yield one row a scene and controller, over all frames after the first second; then what control costs.
 
     budget_ms is T; for what is judged see `budget_report`. "none" has the finest LODs, "coarsest" the coarsest: no
-    budget below can be held. plots is a folder for a figure a scene, None draws nothing.
+    budget below can be held.
 
     Rows with lods have the medians of all stages of the second half of the frames. Of rows with a ratio finest_ms is
     the median frame at the finest LODs, half of its runs before and half after those under control; total_ms that under
@@ -60,13 +60,17 @@ def run(device, quick=False, plots=None):
                 steady = [each for each in frame.history if each.time >= 1.0]
                 budget = budget or middle(steady) / BREACH
                 row = {"scene": name, "objects": loaded.scene.object_count}
-                yield (row | {"budget_ms": budget, "controller": controller} | describe_hold(frame, steady, budget))
+                yield row | {"budget_ms": budget, "controller": controller} | describe_hold(frame, steady, budget)
                 runs[controller] = frame.history
             if plots is not None:
                 draw_runs(name, runs, budget, plots)
         for name in STAGED:
             loaded = load_scene(name, device, objects=QUICK_OBJECTS if quick else None)
-            yield from find_stages(loaded, name, QUICK_FRAMES // 10 if quick else STAGED_FRAMES, options)
+            for lods in ("finest", "coarsest"):
+                staged = QUICK_FRAMES // 10 if quick else STAGED_FRAMES
+                rows = run_settled(loaded, staged, options, coarsest=lods == "coarsest")
+                row = {"scene": name, "objects": loaded.scene.object_count, "lods": lods}
+                yield row | {column: middle(rows, column) for column in ("hits", *STAGES, "total_ms")}
     frames = QUICK_FRAMES // 10 if quick else FRAMES
     for name in CONTROLLED:
         if name == "herd" and importlib.util.find_spec("pxr") is None:
@@ -119,14 +123,6 @@ def draw_runs(name, runs, budget, folder):
             rows.append({"controller": controller, "frame": i} | cost)
     (figure,) = tables.pick(tables.read_layout("cases/figures.toml")["figure"], case="budget")
     print(tables.draw([figure | {"file": f"budget-{name}.svg"}], rows, folder), flush=True)
-
-
-def find_stages(loaded, name, frames, options):
-    """Yield a row at the finest LODs of a scene, and one at the coarsest."""
-    for lods in ("finest", "coarsest"):
-        rows = run_settled(loaded, frames, options, coarsest=lods == "coarsest")
-        row = {"scene": name, "objects": loaded.scene.object_count, "lods": lods}
-        yield row | {column: middle(rows, column) for column in ("hits", *STAGES, "total_ms")}
 
 
 def compare(loaded, name, frames):

@@ -42,39 +42,30 @@ def run(device, quick=False, only=PARTS):
     part `gap` a row a number of pairs, distance of their centres, and gap: more is contacts over those without a gap,
     ratio the time over that without one.
     """
+    sizes, folder, most = QUICK if quick else CPU if device.is_cpu else FULL, ModelFolder(None), 1 if quick else None
     if "nearest" in only:
-        yield from measure_all(device, quick)
-    if "points" in only:
-        folder = ModelFolder(None)
-        for name in [name for name in POINT_MESHES if mesh_file(name)][: 1 if quick else None]:
+        for name in [name for name in MESHES if mesh_file(name)][:most]:
             model = folder.load([name])
+            yield measure(name, [model, model], shapes.place_at_gaps(model, sizes["poses"]), device, sizes["repeats"])
+        if all(map(mesh_file, NUT)) and not quick:
+            models = [folder.load([name]) for name in NUT]
+            matrices = place_nut(models, sizes["poses"])["free"]
+            yield measure("nut on bolt, free", models, matrices, device, sizes["repeats"])
+        knots = knot_model(sizes["knot"])
+        for count in sizes["counts"]:
+            matrices = shapes.pose_matrices(shapes.random_poses(shapes.longest_side(knots), count))
+            yield measure(f"knot, {count} poses", [knots, knots], matrices, device, sizes["repeats"])
+    if "points" in only:
+        models = {name: folder.load([name]) for name in [name for name in POINT_MESHES if mesh_file(name)][:most]}
+        models["torus"] = ab.Model.load(trimesh.creation.torus(1.0, 0.4, *((24, 12) if quick else (96, 48))))
+        for name, model in models.items():
             for has_signs in (True,) if model.winding.is_closed else (False, True):
                 yield measure_points(name, model, device, 300 if quick else POINTS, has_signs)
-        torus = ab.Model.load(trimesh.creation.torus(1.0, 0.4, *((24, 12) if quick else (96, 48))))
-        yield measure_points("torus", torus, device, 300 if quick else POINTS, True)
     if "gap" in only:
         sizes = GAP_QUICK if quick else GAP_FULL
         for about, model, poses in shapes.knot_batches(device, sizes):
             for row in time_gaps(device, model, poses, sizes["repeats"]):
                 yield about | row
-
-
-def measure_all(device, quick):
-    """Yield the rows of distances."""
-    sizes = QUICK if quick else CPU if device.is_cpu else FULL
-    folder = ModelFolder(None)
-    at_hand = [name for name in MESHES if mesh_file(name)]
-    for name in at_hand[:1] if quick else at_hand:
-        model = folder.load([name])
-        yield measure(name, [model, model], shapes.place_at_gaps(model, sizes["poses"]), device, sizes["repeats"])
-    if all(map(mesh_file, NUT)) and not quick:
-        models = [folder.load([name]) for name in NUT]
-        matrices = place_nut(models, sizes["poses"])["free"]
-        yield measure("nut on bolt, free", models, matrices, device, sizes["repeats"])
-    knots = knot_model(sizes["knot"])
-    for count in sizes["counts"]:
-        matrices = shapes.pose_matrices(shapes.random_poses(shapes.longest_side(knots), count))
-        yield measure(f"knot, {count} poses", [knots, knots], matrices, device, sizes["repeats"])
 
 
 @wp.kernel(module="unique")

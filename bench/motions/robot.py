@@ -70,8 +70,8 @@ def make_around(quick):
 def run(device, quick=False, only=PARTS):
     """Yield a row for each output: configurations a second, of random ones within limits.
 
-    On the CPU one thread works. Forward kinematics is part of our time, and none of python-fcl's, which asks pair by
-    pair until two intersect. Answers that differ from its are counted.
+    On the CPU one thread works. Forward kinematics is part of our time, and none of python-fcl's. Answers that differ
+    from its are counted.
     """
     sizes = QUICK if quick else FULL
     with tempfile.TemporaryDirectory() as folder:

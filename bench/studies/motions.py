@@ -33,12 +33,8 @@ class Motions:
         return len(self.away)
 
     def poses(self, along, which=None):
-        """Return poses of B in A's frame, float64 (n, 7), its centre a distance from A's.
-
-        Args:
-            along: Distances [model units], (n,).
-            which: Motions, (n,); None is all in turn.
-        """
+        """Return poses of B in A's frame, float64 (n, 7), its centre so far from A's, (n,) [model units], on motions
+        `which`, (n,); None is all in turn."""
         which = np.arange(len(self)) if which is None else which
         centre_b = matrices_of(self.rotations[which]) @ self.centre_b
         place = self.centre_a + np.asarray(along)[:, None] * self.away[which] - centre_b
@@ -49,10 +45,7 @@ def find_first_contact(intersects, motions, steps=SCAN_STEPS, bisections=BISECTI
     """Return where each motion is first in contact and where it last was free, (m,) each; NaN where it never is.
 
     Equal steps from outside, then bisection between the step in contact and the one before it. A contact shorter than
-    one step may be passed over.
-
-    Args:
-        intersects: Called with poses (n, 7), returns bool (n,).
+    one step may be passed over. `intersects` is called with poses (n, 7) and returns bool (n,).
     """
     count = len(motions)
     along = motions.reach * np.arange(steps, -1, -1) / steps

@@ -74,11 +74,8 @@ class Context:
     def time_launches(self, launches, repeats=None, on_core=False) -> dict:
         """Return the median time [ms] of launches by name, in turn: on CUDA of graph replays.
 
-        Else the CPU time of one thread on one core, each launch once untimed before: caches are full of what ran
-        before, which may have been large.
-
-        Args:
-            on_core: Whether these run on the host whatever the device.
+        Else, and of what runs on the host whatever the device (`on_core`), the CPU time of one thread on one core, each
+        launch once untimed before: caches are full of what ran before, which may have been large.
         """
         if self.device.is_cuda and not on_core:
             return timing.medians(timing.time_in_turn(launches, self.device, repeats or self.size(9, 3)))

@@ -28,7 +28,11 @@ def run(context, workload):
         lods = workload.lods(**{kind: value})
         found = workload.query(lods, workload.poses, "contacts").run()
         row = {"case": "level", "workload": workload.name, "kind": kind, "value": value}
-        row |= describe_errors(workload, lods, found, exact)
+        error, bound = workload.first_contact(workload.ask_at(lods)), workload.bound(lods) / workload.size
+        row |= {"share": workload.fraction(lods), "bound": bound}
+        row |= judge_answers(found.any, exact.any) | judge_contact(error)
+        if bound:
+            row["contact_over_bound"] = (np.abs(error) > bound).sum()
         row |= compare_regions(make_regions(found.contacts, len(workload.poses), workload.size), regions)
         row |= compare_normals(found.pair_contacts, exact.pair_contacts, clear)
         row |= {"contacts": len(found.contacts), "contacts_node_tests": found.node_tests.mean()}
@@ -39,14 +43,6 @@ def run(context, workload):
             about = {"case": "offset", "workload": workload.name, "value": value, "offset": offset}
             yield about | judge_answers(found.any[at], exact.any[at])
     yield from time_levels(context, workload, levels)
-
-
-def describe_errors(workload, lods, found, exact) -> dict:
-    """Return columns of a level: the fraction of the faces, wrong answers, and errors of the first contacts."""
-    error, bound = workload.first_contact(workload.ask_at(lods)), workload.bound(lods) / workload.size
-    row = {"share": workload.fraction(lods), "bound": bound}
-    row |= judge_answers(found.any, exact.any) | judge_contact(error)
-    return row | ({"contact_over_bound": (np.abs(error) > bound).sum()} if bound else {})
 
 
 def time_levels(context, workload, levels):

@@ -116,12 +116,8 @@ def resultants(contacts, poses):
 
 
 def compare_normals(found, truth, clear):
-    """Return columns: angle between the averaged normals [degrees], over poses where both have contacts.
-
-    Args:
-        found, truth: `ab.Result.pair_contacts`.
-        clear: Poses whose normals agree, bool (n,), which stand apart as well.
-    """
+    """Return columns: angle between the averaged normals of two `pair_contacts` [degrees], over poses where both have
+    contacts, and over those of them whose normals agree (`clear`, bool (n,))."""
     cosine = (found["normal"] * truth["normal"]).sum(1)
     sine = np.linalg.norm(np.cross(found["normal"], truth["normal"]), axis=1)
     angle = np.degrees(np.arctan2(sine, cosine))
