@@ -116,34 +116,28 @@ def reorder_pairs(pairs):
 
 @functools.cache
 def pair_test(mode):
-    """Return the kernel that tests triangles corners[i, :3] and corners[i, 3:] in a mode of `predicates`."""
+    """Return the kernel that tests triangles corners[i, 0] and corners[i, 1] in a mode of `predicates`."""
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
-    def test_pair_kernel(corners: wp.array2d(dtype=wp.vec3d), answer_out: wp.array(dtype=wp.int32)):
+    def test_pair_kernel(corners: wp.array3d(dtype=wp.vec3d), answer_out: wp.array(dtype=wp.int32)):
         i = wp.tid()
-        answer_out[i] = testing.decide_triangles(
-            wp.static(mode), corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
-        )
+        a, b = corners[i, 0], corners[i, 1]
+        answer_out[i] = testing.decide_triangles(wp.static(mode), a[0], a[1], a[2], b[0], b[1], b[2])
 
     return test_pair_kernel
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
 def float32_pair_kernel(
-    error: wp.float32, unit: wp.float32, corners: wp.array2d(dtype=wp.vec3), answer_out: wp.array(dtype=wp.int32)
+    error: wp.float32, unit: wp.float32, faces: wp.array2d(dtype=wp.mat33), answer_out: wp.array(dtype=wp.int32)
 ):
     i = wp.tid()
-    answer_out[i] = testing.float32_filter_triangles(
-        error,
-        unit,
-        wp.matrix_from_rows(corners[i, 0], corners[i, 1], corners[i, 2]),
-        wp.matrix_from_rows(corners[i, 3], corners[i, 4], corners[i, 5]),
-    )
+    answer_out[i] = testing.float32_filter_triangles(error, unit, faces[i, 0], faces[i, 1])
 
 
 def time_launch(kernel, inputs, pairs, dtype, device):
     """Return a kernel's answers for pairs, int32 (count,), and the time of its launch [ms]."""
-    corners = wp.array(np.ascontiguousarray(pairs).reshape(-1, 6, 3), dtype=dtype, device=device)
+    corners = wp.array(np.ascontiguousarray(pairs), dtype=dtype, device=device)
     answers = wp.zeros(len(pairs), dtype=wp.int32, device=device)
     launch = functools.partial(wp.launch, kernel, len(pairs), [*inputs, corners, answers], device=device)
     taken = time_call(launch, device)() if len(pairs) else 0.0
@@ -159,7 +153,7 @@ def ask_float32(pairs, device, proven=True):
     """Return the answers of the float32 stage, with its bound or without, and the time [ms]."""
     # Coordinates of at most 1 are off by at most 2^-25, differences by twice as much.
     bound = [1.02 * 2.0**-24, float(testing.FLOAT32_UNIT)] if proven else [0.0, 0.0]
-    return time_launch(float32_pair_kernel, bound, unit_size(pairs).astype(np.float32), wp.vec3, device)
+    return time_launch(float32_pair_kernel, bound, unit_size(pairs).astype(np.float32), wp.mat33, device)
 
 
 def unit_size(pairs):

@@ -67,7 +67,5 @@ def check_baseline(found, ours, model, poses):
     row = {"peer_hits": len(found)}
     row["peer_missed"], row["peer_invented"] = count_differences(found, ours)
     mesh = model.mesh_at(model.lod_max)[:2]
-    judged = judge_disputed(
-        found, ours, (mesh, mesh), lambda pair: poses[2 * pair : 2 * pair + 2], "wp.Bvh", most=JUDGED
-    )
+    judged = judge_disputed(found, ours, (mesh, mesh), poses.reshape(-1, 2, 7).__getitem__, "wp.Bvh", JUDGED)
     return row | {"judged": judged or 0, "ours_wrong": None if judged is None else 0}

@@ -4,6 +4,8 @@ The launch is that of a query over posed objects. `sweep` is timed as called, fr
 in float64 and float32 on the host, and in float32 on the device.
 """
 
+from functools import partial
+
 import numpy as np
 import warp as wp
 
@@ -62,14 +64,12 @@ def run_sweep(device, model, poses, repeats):
     """Return the columns of `sweep`, in turn with poses of each kind."""
     single = poses.astype(np.float32)
     kinds = {"sweep": poses, "sweep32": single, "sweep_on_device": wp.array(single, dtype=wp.float32, device=device)}
-    answers = {kind: ab.sweep(model, model, rows, device=device) for kind, rows in kinds.items()}
+    ask = partial(ab.sweep, model, model, device=device)
+    answers = {kind: ask(rows) for kind, rows in kinds.items()}
     check_sweep(device, model, single, answers["sweep32"])
     if not np.array_equal(answers["sweep32"], answers["sweep_on_device"]):
         raise RuntimeError("poses on the host and on the device are answered differently")
-    runs = {
-        kind: time_call(lambda rows=rows: ab.sweep(model, model, rows, device=device), device)
-        for kind, rows in kinds.items()
-    }
+    runs = {kind: time_call(partial(ask, rows), device) for kind, rows in kinds.items()}
     row = {"meet": answers["sweep32"].mean()} | summarise(time_rounds(runs, min(repeats, 5)))
     rates = {f"{kind}_mposes_s": len(poses) / row[f"{kind}_ms"] / 1e3 for kind in kinds}
     return row | rates | used_memory(device)

@@ -176,16 +176,17 @@ def call_scene(ask, count, output):
 def launches(ask):
     """Return makers of launches by name, and those of calls that wait for the device."""
     many = ask.many
-    knots = {"query, 1 pair": (1, 0.9, 1.0, "faces")}
-    knots |= {f"query, {n} pairs at {d}": (n, d, 1.0, "faces") for n, d in ((ask.few, 0.9), (many, 0.2))}
+
+    def of_knots(output, *placed):
+        return lambda: launch_query(*ask.pairs(*placed), output)
+
+    made = {"query, 1 pair": of_knots("faces", 1)}
+    made |= {f"query, {n} pairs at {d}": of_knots("faces", n, d) for n, d in ((ask.few, 0.9), (many, 0.2))}
     if ask.device.is_cuda and not ask.quick:
-        knots["query, 8192 pairs at 0.9"] = 8192, 0.9, 1.0, "faces"
-    knots |= {f"query {many}, {output}": (many, 0.9, 1.0, output) for output in ("any", "contacts")}
-    for fraction in (0.1, 0.01):
-        knots |= {
-            f"coarse {fraction}, {output}": (many, 0.9, fraction, output) for output in ("faces", "any", "contacts")
-        }
-    made = {name: lambda at=at: launch_query(*ask.pairs(*at[:3]), at[3]) for name, at in knots.items()}
+        made["query, 8192 pairs at 0.9"] = of_knots("faces", 8192)
+    made |= {f"query {many}, {output}": of_knots(output, many) for output in ("any", "contacts")}
+    coarse = [(fraction, output) for fraction in (0.1, 0.01) for output in ("faces", "any", "contacts")]
+    made |= {f"coarse {fraction}, {output}": of_knots(output, many, 0.9, fraction) for fraction, output in coarse}
     made |= {f"distance {many}, {kind}": partial(launch_distance, ask, kind == "fresh") for kind in ("fresh", "again")}
     made[f"motion, {many}"] = partial(launch_motion, ask)
     made |= {f"update, {fraction}": partial(launch_update, ask, fraction) for fraction in (0.003, 0.1, 0.9)}
