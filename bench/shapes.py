@@ -44,9 +44,9 @@ def random_directions(rng, *shape):
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def pair_poses(pair_count, distance, seed=0):
+def pair_poses(pair_count, distance):
     """Return float32 (2 P, 7): objects 2p and 2p+1 form pair p, any rotations, their centres at a distance."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     poses = np.zeros((2 * pair_count, 7), np.float32)
     poses[:, 3:] = random_directions(rng, 2 * pair_count, 4)
     poses[1::2, :3] = random_directions(rng, pair_count, 3) * distance

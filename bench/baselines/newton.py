@@ -73,7 +73,7 @@ class Newton(Pipeline):
         sdf: Voxels along the longest side of a signed distance field, 0 for the BVH.
     """
 
-    def __init__(self, vertices, faces, poses, hits, device, sdf=0):
+    def __init__(self, vertices, faces, poses, hits, device, sdf):
         import newton
 
         self.pair_count = len(poses) // 2

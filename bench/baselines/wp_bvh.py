@@ -148,7 +148,7 @@ class BvhPosed(FaceBvh):
         return rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))]
 
 
-def find_constructor(vertices, faces, poses, device, repeats=5) -> str:
+def find_constructor(vertices, faces, poses, device) -> str:
     """Return the constructor whose tree answers fastest."""
     launches = {}
     for name in CONSTRUCTORS:
@@ -156,5 +156,5 @@ def find_constructor(vertices, faces, poses, device, repeats=5) -> str:
             continue
         with contextlib.suppress(RuntimeError, ValueError):  # not compiled in
             launches[name] = BvhPosed(vertices, faces, poses, 0, device, name).launch
-    times = medians(time_in_turn(launches, device, repeats))
+    times = medians(time_in_turn(launches, device, repeats=5))
     return min(times, key=times.get)

@@ -68,11 +68,11 @@ def rest_nuts(models, count, seed):
     return follow_thread(angles, height + rng.uniform(-1e-6, 5e-6, count))
 
 
-def turned(angle, x=0.0, y=0.0, z=0.0, centre=(0.0, 0.0, 0.0)):
-    """Return a matrix that turns about z, around a centre, and then moves."""
+def turned(angle, z=0.0, centre=(0.0, 0.0, 0.0)):
+    """Return a matrix that turns about z, around a centre, and then moves along it."""
     matrix = np.eye(4)
     matrix[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    matrix[:3, 3] = centre - matrix[:3, :3] @ centre + (x, y, z)
+    matrix[:3, 3] = centre - matrix[:3, :3] @ centre + (0.0, 0.0, z)
     return matrix
 
 

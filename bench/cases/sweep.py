@@ -75,9 +75,9 @@ def run_sweep(device, model, poses, repeats):
     return row | rates | used_memory(device)
 
 
-def check_sweep(device, model, poses, found, checked=1024):
+def check_sweep(device, model, poses, found):
     """Ask some poses of a sweep as objects of a scene: the answers must be equal."""
-    some = np.unique(np.linspace(0, len(poses) - 1, checked).astype(int))
+    some = np.unique(np.linspace(0, len(poses) - 1, 1024).astype(int))
     scene, pairs = scene_of_poses(device, model, model, poses[some])
     if not np.array_equal(scene.intersect(pairs).any, found[some]):
         raise RuntimeError("the sweep and the query differ")

@@ -33,9 +33,8 @@ def write_arm(folder: Path, fine) -> Path:
     tube.apply_translation((0, 0, LENGTH / 2 - tube.bounds.mean(0)[2]))
     tube.export(folder / "tube.stl")
     part = '<geometry><mesh filename="tube.stl"/></geometry>'
-    lines = [
-        f'<link name="link{k}"><visual>{part}</visual><collision>{part}</collision></link>' for k in range(LINKS + 1)
-    ]
+    both = f"<visual>{part}</visual><collision>{part}</collision>"
+    lines = [f'<link name="link{k}">{both}</link>' for k in range(LINKS + 1)]
     for k in range(LINKS):
         axis, limit = ("0 0 1", 2.9) if k % 2 == 0 else ("0 1 0", 1.8)
         lines.append(
