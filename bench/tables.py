@@ -88,16 +88,17 @@ def select_rows(layout, study):
     A layout's `rows` are [part, where, *texts], each with the values of one row of the study in its texts.
     """
     if "rows" in layout:
-        shown_rows = []
-        for part, where, *texts in layout["rows"]:
-            (row,) = pick(study["parts"][part]["rows"], **where)
-            named = zip(layout["columns"], texts, strict=True)
-            shown_rows.append({name: text.format(**row) for (name, _), text in named})
-        return shown_rows
+        return [show_row(study, layout["columns"], *row) for row in layout["rows"]]
     rows = pick(study["parts"].get(layout["part"], {"rows": []})["rows"], **layout.get("where", {}))
     if rows and "select" in layout:
         rows = importlib.import_module(f"bench.studies.{study['study']}").SUMMARIES[layout["select"]](rows)
     return rows
+
+
+def show_row(study, columns, part, where, *texts) -> dict:
+    """Return a row of texts, the values of one row of the study filled in."""
+    (row,) = pick(study["parts"][part]["rows"], **where)
+    return {name: text.format(**row) for (name, _), text in zip(columns, texts, strict=True)}
 
 
 def markdown_table(layout, study, short=None) -> str:

@@ -90,8 +90,8 @@ class Fcl:
 
 
 class FclRobot:
-    """python-fcl, asked what an `ab.Robot` is asked: a BVHModel a link, pair by pair until two intersect, and one of
-    the model of what surrounds it."""
+    """python-fcl, asked what an `ab.Robot` is asked about a model around it: a BVHModel a link, pair by pair until two
+    intersect."""
 
     def __init__(self, robot, around):
         import fcl

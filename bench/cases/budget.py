@@ -105,7 +105,7 @@ def middle(rows, stage="total_ms"):
 
 
 def describe_hold(frame, steady, budget):
-    """Return the columns of one run, some of whose rows are those after the first second."""
+    """Return the columns of one run; `steady` are its rows after the first second."""
     found = budget_report(frame.history, budget)
     names = ("within", "within_110_percent", "worst", "oscillations", "error_mean")
     row = {"judged": found["frames"]} | {name: found[name] for name in names}

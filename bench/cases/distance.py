@@ -42,7 +42,8 @@ def run(device, quick=False, only=PARTS):
     part `gap` a row a number of pairs, distance of their centres, and gap: more is contacts over those without a gap,
     ratio the time over that without one.
     """
-    sizes, folder, most = QUICK if quick else CPU if device.is_cpu else FULL, ModelFolder(None), 1 if quick else None
+    sizes = QUICK if quick else CPU if device.is_cpu else FULL
+    folder, most = ModelFolder(None), 1 if quick else None
     if "nearest" in only:
         for name in [name for name in MESHES if mesh_file(name)][:most]:
             model = folder.load([name])

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
-from bench.meshes import NUT, ModelFolder, mesh_file
+from bench.meshes import ModelFolder, mesh_file
 from bench.shapes import knot, pair_poses, pose_matrices, random_poses, scene_of_objects, scene_of_pairs, scene_of_poses
 from bench.timing import make_runs, time_call
 from warp_abtree import testing
@@ -24,6 +24,7 @@ from warp_abtree import testing
 FACES = {False: 5000, True: 300}  # of a knot; quick
 FIELDS = ("pairs", "any", "apart", "count", "faces", "contacts", "pair_contacts", "points", "distance", "bracket")
 FIELDS += ("point_faces", "time", "clear", "undecided")
+NUT = ("factory-bolt-m20", "factory-nut-m20")
 NUT_POSE = (0, 0, 0.0204, 0, 0, 0, 1)  # crosses the thread
 LAUNCHES_BEFORE = 20  # what is asked often makes slabs first
 

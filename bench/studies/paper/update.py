@@ -43,8 +43,8 @@ def time_move(context, scene, model, home, there):
     """Return the row of one LOD change, both kinds of refit checked against each other first."""
     scene.set_lods([home])
     k, nodes, entries, launches = check_update(scene, [there], [home], model.face_count)
-    # In turn, at the same LOD: a refit repeated alone is one that the processor knows by heart.
     scene.set_lods([there])
+    # In turn, at the same LOD: a refit repeated alone is one that the processor knows by heart.
     times = context.time_graphs({kind: forth for kind, (forth, _) in launches.items()})
     scene.set_lods([home])
     (forth, back), (between, after) = launches["update"], launches["full"]

@@ -1,7 +1,5 @@
 """Workloads of the trade-off: two models, motions of B towards A, and poses along them."""
 
-from functools import partial
-
 import numpy as np
 
 import warp_abtree as ab
@@ -82,9 +80,10 @@ class Workload:
 
     def query(self, lods, poses, output, **options):
         """Return a query of poses at LODs, whose first run makes room for what it finds."""
-        kinds = {"contacts": ab.ContactQuery, "distance": ab.DistanceQuery}
+        make = {"contacts": ab.ContactQuery, "distance": ab.DistanceQuery}.get(output)
+        asked = {} if make else {"output": output}
         scene, pairs = self.place(lods, poses)
-        return kinds.get(output, partial(ab.Query, output=output))(scene, pairs=pairs, **options)
+        return (make or ab.Query)(scene, pairs=pairs, **asked, **options)
 
     def lods(self, fraction=None, tolerance=None):
         """Return LODs of A and B: of a fraction of the faces (0 is the base), or of errors that sum to a tolerance."""
