@@ -152,6 +152,15 @@ LODS = "count = 100\nlod = [9, 8, 7, 6{}]\n"
 # Limits of a whole file: a low value of one, what may follow `ONE`, what may not, and what is said of that.
 LIMITS = {
     "bytes": (decode, "FILE_SIZE_LIMIT", len(ONE), "", "\n", f"the file: has more than {len(ONE)} bytes"),
+    # Of which characters have several.
+    "letters": (
+        decode,
+        "FILE_SIZE_LIMIT",
+        len(ONE) + 4,
+        "# é",
+        "# éé",
+        f"the file: has more than {len(ONE) + 4} bytes",
+    ),
     # A model takes memory once for each LOD that an object begins at, whatever the number of objects.
     "LODs": (
         scene_file,

@@ -67,7 +67,12 @@ def _parse(path, msgspec, text: str | None):
     """Return the TOML of a file, or of `text` in its place, as dictionaries and lists."""
     if text is None:
         with open(path, "rb") as file:
-            text = file.read(FILE_SIZE_LIMIT + 1).decode("utf-8-sig")  # some editors write a mark in front
+            written = file.read(FILE_SIZE_LIMIT + 1)
+    else:
+        written = text.encode()
+    if len(written) > FILE_SIZE_LIMIT:
+        fail(path, "the file", f"has more than {FILE_SIZE_LIMIT:,} bytes")
+    text = written.decode("utf-8-sig")  # some editors write a mark in front
     _check_text(path, text)
     try:
         return msgspec.toml.decode(text)
@@ -77,8 +82,6 @@ def _parse(path, msgspec, text: str | None):
 
 def _check_text(path, text: str):
     """Refuse what the parser would take too long or too much memory for."""
-    if len(text) > FILE_SIZE_LIMIT:
-        fail(path, "the file", f"has more than {FILE_SIZE_LIMIT:,} bytes")
     bare = _QUOTED.sub(lambda found: "'" + "\n" * found[0].count("\n"), text)
     tables = 0
     for found in _PIECE.finditer(bare):
