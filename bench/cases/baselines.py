@@ -72,6 +72,7 @@ def measure(models, device, kinds, matrices, places, repeats, clock=None, judged
     """
     a = models[0].mesh_at(models[0].lod_max)[:2]
     meshes = a, a if models[1] is models[0] else models[1].mesh_at(models[1].lod_max)[:2]
+    face_ids = [model.mesh_at(model.lod_max)[2] for model in models]
     scene, pairs = scene_of_poses(device, *models, matrices)
     queries = {output: ab.Query(scene, output, pairs=pairs[places[output]]) for output in ("any", "faces")}
     answers, ours = {}, {output: to_host(query) for output, query in queries.items()}
@@ -85,7 +86,7 @@ def measure(models, device, kinds, matrices, places, repeats, clock=None, judged
     for kind in kinds:
         try:
             made[kind.name] = {question: kind(*meshes, matrices[some]) for question, some in places.items()}
-            rows[kind.name] = compare(made[kind.name], answers, meshes, matrices[places["faces"]], judged)
+            rows[kind.name] = compare(made[kind.name], answers, meshes, face_ids, matrices[places["faces"]], judged)
         except ImportError as error:
             rows[kind.name] = {"skipped": str(error)}
     for question, call in ours.items():
@@ -97,13 +98,17 @@ def measure(models, device, kinds, matrices, places, repeats, clock=None, judged
     return answers, rows, times
 
 
-def compare(made, answers, meshes, matrices, judged) -> dict:
-    """Return what a library misses and invents beside our answers, where it answers; the oracle finds none wrong."""
+def compare(made, answers, meshes, face_ids, matrices, judged) -> dict:
+    """Return what a library misses and invents beside our answers, where it answers; the oracle finds none wrong.
+
+    A library numbers the faces of its meshes, which are the models' faces of some indices.
+    """
     met, answer = answers["any"].any, np.array(made["any"].any(), bool)
     row = {"any_missed": (met & ~answer).sum(), "any_invented": (answer & ~met).sum()}
     one, far = made["faces"], made.get("distances")
     if hasattr(one, "faces"):
-        ours, poses = answers["faces"].faces, [(np.eye(4), matrix) for matrix in matrices]
+        found, poses = answers["faces"].faces.T, [(np.eye(4), matrix) for matrix in matrices]
+        ours = np.stack([found[0], *(np.searchsorted(ids, faces) for ids, faces in zip(face_ids, found[1:]))], 1)
         theirs = list({(pose, *pair) for pose, found in enumerate(one.faces()) for pair in one.face_pairs(found)})
         wrong = judge_disputed(theirs, ours, meshes, poses.__getitem__, one.name, judged)
         row["faces_missed"], row["faces_invented"] = count_differences(theirs, ours)
