@@ -70,27 +70,26 @@ def are_across(contacts: Contacts, normal: wp.array(dtype=wp.vec3d), i: wp.int32
     return opposed and wp.dot(between, normal[i]) > zero and wp.dot(between, normal[j]) < zero
 
 
-@wp.func
-def contact_key(pair: wp.int32, face: wp.int32):
-    """Return the key that sorts contacts by their pairs, and those by faces of B."""
-    return (wp.int64(pair) << wp.int64(31)) | wp.int64(face)
-
-
 @wp.kernel
 def begin_loop_kernel(
+    width: wp.int32,
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     curves_out: Curves,
     order_out: wp.array(dtype=wp.int32),
     key_out: wp.array(dtype=wp.int64),
 ):
-    """Make each contact a loop of its own, with a key that brings contacts of one face of B together."""
+    """Make each contact a loop of its own, with a key that brings contacts of one face of B together.
+
+    Args:
+        width: Bits that a face takes in a key, below its pair.
+    """
     i = wp.tid()
     order_out[i] = i
     key_out[i] = LAST_KEY
     if i < start[start.shape[0] - 1]:
         curves_out.parent[i] = i
-        key_out[i] = contact_key(faces[i][0], faces[i][2])
+        key_out[i] = (wp.int64(faces[i][0]) << wp.int64(width)) | wp.int64(faces[i][2])
 
 
 @native.func_native(cpu=True)

@@ -61,9 +61,9 @@ class PointParts:
 
     def __init__(self, query: Any, stages: list[Any], pairs: int, hits: int, uncertain: int):
         self.count = min(pairs, max(-(-hits // HITS_AT_ONCE), -(-uncertain // UNCERTAIN_AT_ONCE)))
-        rooms = Buffers(
-            min(hits, HITS_AT_ONCE), -(-query.rooms.pairs // self.count), min(uncertain, UNCERTAIN_AT_ONCE) or None
-        )
+        # Twice an even share: contacts are sorted, and looked at, as many as there is room for.
+        hits = min(hits, HITS_AT_ONCE, -(-2 * hits // self.count))
+        rooms = Buffers(hits, -(-query.rooms.pairs // self.count), min(uncertain, UNCERTAIN_AT_ONCE) or None)
         self._gaps = next((stage for stage in stages if isinstance(stage, PartGaps)), None)
         self._points, self._lent = stages[-1], -1  # generation of the lists that the query has
         self._none = wp.empty(0, dtype=wp.float64, device=query.device)  # gaps where there are none

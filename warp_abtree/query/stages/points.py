@@ -164,11 +164,12 @@ class PointStage(Stage):
         """Find the loops of what crosses, and offer its candidates to the slots. Launches only."""
         of, operator, curves, launch = self._contacts, self.operator, self.curves, self.operator.launch_kernel
         start, faces, contacts, sorted_by = of.start, of.faces, of.contacts, (of.order, of.key)
-        launch(loops.begin_loop_kernel, count, [start, faces, curves, *sorted_by])
-        self._sort_keys(count, 31 + operator.rooms.pairs.bit_length())
+        width = int(operator.batch.models.face_count.max()).bit_length()
+        launch(loops.begin_loop_kernel, count, [width, start, faces, curves, *sorted_by])
+        self._sort_keys(count, width + operator.rooms.pairs.bit_length())
         launch(loops.link_loop_kernel, count, [start, faces, contacts, *sorted_by, curves])
         launch(loops.name_loop_kernel, count, [start, curves, *sorted_by])
-        self._sort_keys(count, 31)
+        self._sort_keys(count, count.bit_length())
         inputs = [*posed[:2], start, faces, contacts, of.order, curves]
         launch(loops.average_loop_kernel, -(-count // WARP_SIZE) * WARP_SIZE, inputs, WARP_SIZE)
         if operator.uses_warps():
