@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
-from warp_abtree.model.files.found import MeshError, Remarks, empty_scene
+from warp_abtree.model.files.found import MeshError, Remarks, empty_scene, refusing
 from warp_abtree.model.files.polygons import triangulate
 
 PRIMITIVES = ("lines", "polygons", "polylist", "triangles", "trifans", "tristrips")
@@ -25,13 +25,11 @@ def read_collada(data: bytes, where: str, remarks: Remarks):
         import collada
     except ImportError:
         raise MeshError(f"{where}: reading it needs pycollada: pip install pycollada") from None
-    try:
+    with refusing(f"{where}: cannot be read as dae"):  # XML, or whatever goes wrong inside the parser
         file = collada.Collada(io.BytesIO(data), ignore=[collada.common.DaeError])
         if file.errors:
             data = _without_strange_primitives(data, remarks)
             file = collada.Collada(io.BytesIO(data), ignore=[collada.common.DaeError])
-    except Exception as error:  # XML, or whatever goes wrong inside the parser
-        raise MeshError(f"{where}: cannot be read as dae: {first_line(error)}") from None
     for broken in map(first_line, file.errors):
         if not any(word in broken.lower() for word in COLLADA_LOOKS):
             remarks.add("left out what is broken:", broken)
@@ -123,10 +121,8 @@ def _positions(geometry, where) -> np.ndarray:
         turned = sorted(names) == list("XYZ") and names != "XYZ"
         if turned or found.get("stride", "3") != "3" or found.get("offset", "0") != "0":
             raise MeshError(f"{place} has positions that are not X, Y and Z side by side")
-        try:
+        with refusing(f"{place} has positions that cannot be read", ValueError):
             return np.array((source.findtext("{*}float_array") or "").split(), np.float64).reshape(-1, 3)
-        except ValueError as error:
-            raise MeshError(f"{place} has positions that cannot be read: {first_line(error)}") from None
     raise MeshError(f"{place} has no positions")
 
 

@@ -1,10 +1,13 @@
 """Surfaces that readers of mesh files return, their remarks, and the error that they raise."""
 
+import contextlib
 import inspect
 import warnings
 from dataclasses import dataclass
 
 import numpy as np
+
+from warp_abtree.checks.arguments import first_line
 
 NAMED = 4  # things that a warning lists by name
 ROOT_FRAME = "\0"  # frame that nodes hang on; one of them may be called as trimesh calls it
@@ -20,6 +23,18 @@ def warn_caller(message: str, category: type[Warning] = RuntimeWarning):
     while frame is not None and frame.f_globals.get("__name__", "").startswith("warp_abtree."):
         frame, level = frame.f_back, level + 1
     warnings.warn(message, category, stacklevel=level)
+
+
+@contextlib.contextmanager
+def refusing(message: str, errors: type[Exception] | tuple = Exception, with_type=False):
+    """Raise MeshError in the place of errors inside: a message, perhaps the error's type, and its first line."""
+    try:
+        yield
+    except MeshError:
+        raise
+    except errors as error:
+        kind = f"{type(error).__name__}: " if with_type else ""
+        raise MeshError(f"{message}: {kind}{first_line(error)}") from None
 
 
 def empty_scene():

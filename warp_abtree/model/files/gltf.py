@@ -1,7 +1,6 @@
 """glTF and GLB files: the triangles of their nodes, an object a node whatever its number of materials."""
 
 import base64
-import binascii
 import json
 import struct
 from urllib.parse import unquote
@@ -9,7 +8,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
-from warp_abtree.model.files.found import MeshError, Remarks, empty_scene
+from warp_abtree.model.files.found import MeshError, Remarks, empty_scene, refusing
 from warp_abtree.model.files.polygons import cut_strip
 from warp_abtree.model.files.unpack import exceeds_limit
 
@@ -27,25 +26,19 @@ def read_gltf(data: bytes, where: str, resolver, remarks: Remarks):
 
     Raises MeshError where it is damaged, such a file is missing, or it requires an extension that is not read.
     """
-    try:
+    unreadable = ValueError, KeyError, TypeError, RecursionError, struct.error
+    with refusing(f"{where}: cannot be read as glTF", unreadable, with_type=True):
         text, binary = _split_binary(data, where) if data[:4] == b"glTF" else (data, None)
         tree = json.loads(text)
         version = str(tree["asset"]["version"])
-    except MeshError:
-        raise
-    except (ValueError, KeyError, TypeError, RecursionError, struct.error) as error:
-        raise MeshError(f"{where}: cannot be read as glTF: {type(error).__name__}: {first_line(error)}") from None
     if not version.startswith("2."):
         raise MeshError(f"{where}: is glTF {version}, only 2 is read")
     for name in tree.get("extensionsRequired", ()):
         if name not in READ and not name.startswith(LOOKS):
             raise MeshError(f"{where}: requires the glTF extension {name}, which is not read")
-    try:
+    damaged = KeyError, IndexError, TypeError, AttributeError, ValueError
+    with refusing(f"{where}: is damaged", damaged, with_type=True):
         return _Reader(tree, binary, where, resolver, remarks).scene()
-    except MeshError:
-        raise
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
-        raise MeshError(f"{where}: is damaged: {type(error).__name__}: {first_line(error)}") from None
 
 
 def _split_binary(data, where):
@@ -152,12 +145,10 @@ class _Reader:
                 vertices.append(points)
                 count += len(points)
             faces.append(triangles + starts[key])
-        if not faces or not sum(map(len, faces)):
-            self._meshes[index] = None
-            return None
-        scene.geometry[name] = trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
-        self._meshes[index] = name
-        return name
+        self._meshes[index] = name if sum(map(len, faces)) else None
+        if self._meshes[index] is not None:
+            scene.geometry[name] = trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
+        return self._meshes[index]
 
     def _triangles(self, primitive, name):
         """Return vertices and triangles of a primitive."""
@@ -194,11 +185,9 @@ class _Reader:
         except ImportError:
             raise MeshError(f"{where}: {DRACO} needs DracoPy: pip install DracoPy") from None
         data, _ = self._view(packed["bufferView"])
-        try:
+        with refusing(f"{where}: {DRACO} cannot be read"):  # whatever goes wrong inside the decoder
             found = DracoPy.decode(bytes(data))
             return np.asarray(found.points, np.float64), np.asarray(found.faces)
-        except Exception as error:  # whatever goes wrong inside the decoder
-            raise MeshError(f"{where}: {DRACO} cannot be read: {first_line(error)}") from None
 
     def _instances(self, attributes):
         """Return the matrices of the instances of a node."""
@@ -227,12 +216,11 @@ class _Reader:
                     head, _, text = uri.partition(",")
                     if not head.endswith(";base64"):
                         raise ValueError("its data are not base64")
-                    found = base64.b64decode(text, validate=True)
+                    self._buffers[index] = base64.b64decode(text, validate=True)
                 else:
-                    found = self.resolver.get(unquote(uri))
-            except (OSError, KeyError, ValueError, binascii.Error) as error:
+                    self._buffers[index] = self.resolver.get(unquote(uri))
+            except (OSError, KeyError, ValueError) as error:
                 raise MeshError(f"{self.where}: buffer {uri[:60]!r} cannot be read: {first_line(error)}") from None
-            self._buffers[index] = found
         return self._buffers[index]
 
     def _accessor(self, index):

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line
 from warp_abtree.model.files.collada import read_collada
-from warp_abtree.model.files.found import FileSurface, MeshError, Remarks, empty_scene
+from warp_abtree.model.files.found import FileSurface, MeshError, Remarks, empty_scene, refusing
 from warp_abtree.model.files.gltf import read_gltf
 from warp_abtree.model.files.obj import read_obj
 from warp_abtree.model.files.off import read_off
@@ -57,12 +56,10 @@ def read_file(path: Path, remarks: Remarks):
         raise MeshError(f"{path}: not a mesh file; a built model is read by Model.open")
     if kind in USD:
         raise MeshError(f"{path}: USD is read by scene_from_file alone, as a scene of its objects")
-    try:
+    with refusing(f"{path}: cannot be read", (OSError, EOFError, zlib.error)):
         data = path.read_bytes()
         if zipped:
             data = gunzip(data, str(path))
-    except (OSError, EOFError, zlib.error) as error:
-        raise MeshError(f"{path}: cannot be read: {first_line(error)}") from None
     if data.startswith(b"version https://git-lfs"):
         raise MeshError(f"{path}: stands for a file that Git LFS has, which was not fetched (git lfs pull)")
     return _read_data(data, kind, str(path), None, remarks)
@@ -88,7 +85,7 @@ def _read_data(data, kind, where, resolver, remarks):
         raise MeshError(f"{where}: reading it needs {NEEDED[kind]}: pip install {NEEDED[kind]}")
     if kind not in known:
         raise MeshError(f"{where}: cannot be read: unknown extension '{kind}'; known here: {' '.join(sorted(known))}")
-    try:
+    with refusing(f"{where}: cannot be read as {kind}"):  # trimesh's readers raise whatever goes wrong inside them
         if kind in ("zip", "zae"):
             return _read_archive(unzip(data, where), where, remarks)
         if kind == "3mf":
@@ -97,10 +94,6 @@ def _read_data(data, kind, where, resolver, remarks):
             # Older NumPy only warns where a number in a text file cannot be read, and cuts the file short there.
             warnings.filterwarnings("error", message="string or file could not be read")
             return trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
-    except MeshError:
-        raise
-    except Exception as error:  # trimesh's readers raise whatever goes wrong inside them
-        raise MeshError(f"{where}: cannot be read as {kind}: {first_line(error)}") from None
 
 
 def _known_formats() -> set[str]:

@@ -6,8 +6,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line
-from warp_abtree.model.files.found import MeshError, Remarks, empty_scene
+from warp_abtree.model.files.found import MeshError, Remarks, empty_scene, refusing
 
 MODEL = "3D/3dmodel.model"  # where most writers put it, whatever the relationships of the package say
 EXTENSIONS = ("/production/", "/material/")  # extensions that a file may require
@@ -20,12 +19,9 @@ def read_3mf(members: dict[str, bytes], where: str, remarks: Remarks):
 
     Raises MeshError where it is damaged, requires an extension that is not read, or its build places nothing.
     """
-    try:
+    damaged = KeyError, ValueError, TypeError, OverflowError, ElementTree.ParseError
+    with refusing(f"{where}: is damaged", damaged, with_type=True):
         return _Package(members, where, remarks).scene()
-    except MeshError:
-        raise
-    except (KeyError, ValueError, TypeError, OverflowError, ElementTree.ParseError) as error:
-        raise MeshError(f"{where}: is damaged: {type(error).__name__}: {first_line(error)}") from None
 
 
 class _Package:
