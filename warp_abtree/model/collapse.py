@@ -14,6 +14,7 @@ from warp_abtree.kernels.build.heap import Heap
 from warp_abtree.kernels.build.quadric import Quadric
 from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, unwritten
 from warp_abtree.model.files.polygons import distinct_corners
+from warp_abtree.model.winding import sorted_edges
 
 # Merges per launch.
 MERGES = 25_000
@@ -47,7 +48,7 @@ class Collapse:
     def _prepare(self):
         """Weigh the faces, and make a heap of all edges."""
         faces, nodes = self._faces, len(self.pos)
-        edges, boundary = _edges(faces)
+        edges, boundary = _edges(faces, self.vertex_count)
         face_array = cpu_array(faces, int)
         self._surface = surface = collapse.Surface()
         surface.pos = wp.array(self.pos, dtype=wp.vec3d, device="cpu", copy=False)
@@ -118,17 +119,12 @@ class Collapse:
             self._heap = struct_of(Heap, "cpu", pair=pair, key=key)
 
 
-def _edges(faces):
+def _edges(faces, vertex_count):
     """Return the packed edges of the faces with three corners, ascending, and which corners start a boundary edge."""
-    valid = distinct_corners(faces)
-    start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
-    pair = (np.minimum(start, end) << 32) | (np.maximum(start, end) << 2)
-    slot = np.flatnonzero(np.repeat(valid, 3))
-    pair = pair.reshape(-1)[slot]
-    order = np.argsort(pair)
-    pair = pair[order]
-    first = np.flatnonzero(np.concatenate([[True], pair[1:] != pair[:-1]]))
-    single = np.diff(np.append(first, len(pair))) == 1
-    boundary = np.zeros(faces.size, dtype=np.int8)
-    boundary[slot[order[first[single]]]] = 1
-    return pair[first], boundary.reshape(faces.shape)
+    rows = np.flatnonzero(distinct_corners(faces))
+    key, _, corner, start, count = sorted_edges(faces[rows].astype(np.int64), vertex_count)
+    low, high = np.divmod(key[start], vertex_count)
+    boundary = np.zeros(faces.shape, dtype=np.int8)
+    row, place = np.divmod(corner[start[count == 1]], 3)
+    boundary[rows[row], place] = 1
+    return (low << 32) | (high << 2), boundary

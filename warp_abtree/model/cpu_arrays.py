@@ -11,9 +11,9 @@ def cpu_array(values, dtype):
     return wp.array(values, dtype=dtype, device="cpu")
 
 
-def filled(shape, value, dtype=int):
-    """Return an array on the CPU, in memory of NumPy's: that lies on huge pages where the system has them."""
-    return wp.array(np.full(shape, value, np.int32), dtype=dtype, device="cpu", copy=False)
+def filled(shape, value):
+    """Return an int32 array on the CPU, in memory of NumPy's: that lies on huge pages where the system has them."""
+    return wp.array(np.full(shape, value, np.int32), dtype=int, device="cpu", copy=False)
 
 
 def unwritten(shape, dtype=int):

@@ -12,10 +12,10 @@ import numpy as np
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.kernels.base.poses import COORDINATE_MIN
 from warp_abtree.model.files.found import FileSurface, MeshError, Remarks
-from warp_abtree.model.files.polygons import distinct_corners
+from warp_abtree.model.files.polygons import distinct_corners, turn
 from warp_abtree.model.files.read import read_file, split_file_name
 from warp_abtree.model.files.usd_mesh import read_warp_asset
-from warp_abtree.model.winding import component_labels, find_winding, keep_outside
+from warp_abtree.model.winding import component_labels, distinct_rows, find_winding, keep_outside, sorted_edges
 
 FACE_LIMIT = 2**30  # int32 forest ids count up to two nodes a vertex, and heap indices up to two a face
 EXTENT_LIMITS = (2.0**-100, 2.0**100)  # boxes are float32
@@ -101,13 +101,10 @@ def describe_mesh(mesh):
     `warp_abtree.model.winding`, else consistent, and outwards if the mesh is closed too. What it holds as a solid is
     told in words.
     """
-    faces = np.delete(mesh.faces, mesh.dropped_faces, axis=0).astype(np.int64)
-    vertex_count = len(mesh.vertices)
-    corners = np.sort(faces, axis=1)
-    edges = np.concatenate([corners[:, [0, 1]], corners[:, [0, 2]], corners[:, [1, 2]]])
-    _, edge_faces = np.unique(edges[:, 0] * vertex_count + edges[:, 1], return_counts=True)
-    lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     winding = find_winding(mesh.vertices, mesh.faces, mesh.dropped_faces)
+    faces, vertex_count = winding.faces, len(mesh.vertices)
+    *_, edge_faces = sorted_edges(faces, vertex_count)
+    lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     right = "outwards" if winding.is_closed else "consistent"
     return {
         "name": mesh.name,
@@ -119,7 +116,7 @@ def describe_mesh(mesh):
         "welded_vertices": mesh.welded_count,
         "dropped_faces": len(mesh.dropped_faces),
         "zero_area_faces": int(np.count_nonzero(_zero_area(mesh.vertices, faces))),
-        "duplicate_faces": len(corners) - len(np.unique(corners, axis=0)),
+        "duplicate_faces": len(faces) - len(distinct_rows(np.sort(faces, axis=1))[0]),
         "open_edges": int(np.count_nonzero(edge_faces == 1)),
         "nonmanifold_edges": int(np.count_nonzero(edge_faces > 2)),
         "components": len(np.unique(component_labels(faces, vertex_count)[np.unique(faces)])),
@@ -263,21 +260,15 @@ def _checked_faces(faces, vertex_count, where):
 
 def _weld(positions):
     """Return the first vertex of each distinct position, ascending, and each vertex's index into that list."""
-    order = np.lexsort(positions.T)  # stable: coincident vertices stay in ascending order
-    ordered = positions[order]
-    starts = np.ones(len(order), dtype=bool)
-    starts[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
-    representative = np.empty(len(order), dtype=np.int64)
-    representative[order] = order[starts][np.cumsum(starts) - 1]
-    is_first = representative == np.arange(len(order))
+    first, number = distinct_rows(positions)
+    representative = first[number]
+    is_first = representative == np.arange(len(positions))
     return np.flatnonzero(is_first), (np.cumsum(is_first) - 1)[representative]
 
 
 def _zero_area(vertices, faces):
-    corner = vertices[faces[:, 0]]
-    x1, y1, z1 = (vertices[faces[:, 1]] - corner).T
-    x2, y2, z2 = (vertices[faces[:, 2]] - corner).T
+    a, b, c = vertices[faces].transpose(1, 0, 2)
     zero = np.ones(len(faces), dtype=bool)
-    for p, q in ((y1 * z2, z1 * y2), (z1 * x2, x1 * z2), (x1 * y2, y1 * x2)):
-        zero &= np.abs(p - q) <= 2.0**-50 * (np.abs(p) + np.abs(q))
+    for axes in ([1, 2], [2, 0], [0, 1]):
+        zero &= turn(a[:, axes], b[:, axes], c[:, axes]) == 0.0
     return zero

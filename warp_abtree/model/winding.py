@@ -115,7 +115,8 @@ def find_winding(vertices, faces, dropped_faces=()) -> Winding:
     """Return the `Winding` of a welded mesh."""
     face_ids = np.delete(np.arange(len(faces)), dropped_faces)
     faces = np.asarray(faces, np.int64)[face_ids]
-    key, forward, row, start, count = _sorted_edges(faces, len(vertices))
+    key, forward, corner, start, count = sorted_edges(faces, len(vertices))
+    row = corner // 3
     odd, two = start[count % 2 == 1], start[count == 2]
     # Bodies that each agree about the outside run along an edge as often one way as the other.
     mixed = (np.add.reduceat(np.where(forward, 1, -1), start) != 0) & ((count == 2) | (len(odd) == 0))
@@ -166,6 +167,16 @@ def component_labels(faces, vertex_count):
     return label
 
 
+def distinct_rows(rows):
+    """Return the lowest of each set of equal rows, in the order of their values, and the place of each row there."""
+    order = np.lexsort(rows.T)  # stable: equal rows stay in ascending order
+    ordered = rows[order]
+    new = np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))
+    place = np.empty(len(rows), np.int64)
+    place[order] = np.cumsum(new) - 1
+    return order[new], place
+
+
 def _place(x) -> str:
     return "(" + ", ".join(f"{value:.6g}" for value in x.tolist()) + ")"
 
@@ -193,37 +204,36 @@ def _propagate(count, first, second, relation, part):
 
 
 def _edges(faces, vertex_count):
-    """Return a key of each face's edges, whether each runs towards the higher vertex, and its face: three a face."""
+    """Return a key of the edge that starts at each corner of faces, and whether it runs towards the higher vertex."""
     tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    return np.minimum(tail, head) * vertex_count + np.maximum(tail, head), tail < head, np.arange(tail.size) // 3
+    return np.minimum(tail, head) * vertex_count + np.maximum(tail, head), tail < head
 
 
-def _sorted_edges(faces, vertex_count):
-    """Return what `_edges` does, sorted by the key, and where the faces of each edge start and how many they are."""
-    key, forward, row = _edges(faces, vertex_count)
-    order = np.argsort(key, kind="stable")
-    key, forward, row = key[order], forward[order], row[order]
+def sorted_edges(faces, vertex_count):
+    """Return what `_edges` does, by rising keys, the corners, and where those of each edge start and how many they are.
+
+    A key is the lower vertex times the number of vertices, plus the higher one.
+    """
+    key, forward = _edges(faces, vertex_count)
+    corner = np.argsort(key, kind="stable")
+    key, forward = key[corner], forward[corner]
     start = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
-    return key, forward, row, start, np.diff(np.append(start, len(key)))
+    return key, forward, corner, start, np.diff(np.append(start, len(key)))
 
 
 def _edge_groups(faces, vertex_count):
     """Return the lowest row of the faces that each is joined to by edges, and whether these leave no edge odd."""
-    key, _, row, start, count = _sorted_edges(faces, vertex_count)
-    same = key[1:] == key[:-1]
+    key, _, corner, start, count = sorted_edges(faces, vertex_count)
+    row, same = corner // 3, key[1:] == key[:-1]
     group = component_labels(np.stack([row[:-1][same], row[1:][same]], 1), len(faces))
     return group, ~np.isin(group, group[row[start[count % 2 == 1]]])
 
 
 def _doubled(faces, vertex_count):
     """Return the rows of `Winding.doubled`: all, or those of closed surfaces of faces that cancel."""
-    corners = np.sort(faces, axis=1)
-    order = np.lexsort(corners.T)
-    new = np.append(True, (np.diff(corners[order], axis=0) != 0).any(1))
-    number = np.empty(len(faces), np.int64)
-    number[order] = np.cumsum(new) - 1
+    first, number = distinct_rows(np.sort(faces, axis=1))
     even = np.bincount(number) % 2 == 0
-    once = order[new][even]
+    once = first[even]
     if len(once) < len(even):
         even[even] = _edge_groups(faces[once], vertex_count)[1]
     return np.flatnonzero(even[number])
@@ -232,7 +242,8 @@ def _doubled(faces, vertex_count):
 def _inside_out(vertices, faces, part, doubled):
     """Return the rows of the faces of all parts that are inside out."""
     names, part = np.unique(part, return_inverse=True)
-    key, forward, row = _edges(faces, len(vertices))
+    key, forward = _edges(faces, len(vertices))
+    row = np.arange(key.size) // 3
     edges, edge = np.unique(key, return_inverse=True)
     own, place = np.unique(part[row] * len(edges) + edge, return_inverse=True)
     # Other parts may touch it at an edge, which then has more than two faces.

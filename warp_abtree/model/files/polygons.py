@@ -72,7 +72,7 @@ def _clip_ears(points):
     found = []
     for least in (0.0, 2.0**-40 * np.ptp(points, axis=0).max() ** 2):
         triangles = _cut_ears(points, least)
-        areas = _turn(*points[np.array(triangles)].transpose(1, 0, 2))
+        areas = turn(*points[np.array(triangles)].transpose(1, 0, 2))
         found.append((np.abs(areas).sum(), triangles))
         if found[-1][0] <= (1 + 1e-9) * areas.sum():
             break
@@ -96,7 +96,7 @@ def _cut_ears(points, least):
         else:
             # No ear: corners without area first, which may free others; what crosses itself is cut anyhow.
             ring = np.flatnonzero(left)
-            turns = _turn(points[before[ring]], points[ring], points[after[ring]])
+            turns = turn(points[before[ring]], points[ring], points[after[ring]])
             flat = (turns == 0.0).any()
             if not flat and not all_asked:
                 queue, all_asked = deque(ring), True
@@ -117,22 +117,22 @@ def _is_ear(points, ring, i, j, k, after, least) -> bool:
     corners = points[[i, j, k]]
     if (corners[1] == corners[::2]).all(axis=1).any():
         return True
-    if not _turn(*corners) > least:
+    if not turn(*corners) > least:
         return False
     # Edges whose boxes are beside the triangle's do not enter it.
     ends, margin = np.stack([points[ring], points[after[ring]]]), least**0.5
     low, high = corners.min(axis=0) - margin, corners.max(axis=0) + margin
     near = ((ends.max(axis=0) >= low) & (ends.min(axis=0) <= high)).all(axis=1)
     ring, ends = ring[near], ends[:, near]
-    turns = _turn(corners[:, None], corners[[1, 2, 0], None], ends[:, None])
+    turns = turn(corners[:, None], corners[[1, 2, 0], None], ends[:, None])
     if least and not (turns[0][:, ~np.isin(ring, (i, j, k))] < -least).any(axis=0).all():
         return False
     beyond = (turns <= 0.0).all(axis=0).any(axis=0)
-    sides = _turn(ends[0, :, None], ends[1, :, None], corners)
+    sides = turn(ends[0, :, None], ends[1, :, None], corners)
     return bool((beyond | (sides >= 0.0).all(axis=1) | (sides <= 0.0).all(axis=1)).all())
 
 
-def _turn(a, b, c):
+def turn(a, b, c):
     """Return twice the area of triangles of the plane, negative where they turn right, 0 within rounding."""
     u, v = b - a, c - a
     p, q = u[..., 0] * v[..., 1], u[..., 1] * v[..., 0]
