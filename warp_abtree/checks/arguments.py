@@ -5,6 +5,8 @@ import os
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.upload import view_memory
+
 # Process in which the library first looked for a device, and so started Warp.
 _started_in: int | None = None
 
@@ -59,12 +61,8 @@ def _wrap_cuda_array(values):
     described, device = values.__cuda_array_interface__, wp.get_cuda_device()
     if described.get("stream") is not None:
         wp.synchronize_device(device)
-    dtype, shape = wp.dtype_from_numpy(np.dtype(described["typestr"])), described["shape"]
-    strides, address = described.get("strides"), described["data"][0]
-    # Warp calls the deleter when the last view goes: till then it holds the owner of the memory.
-    return wp.array(
-        ptr=address, dtype=dtype, shape=shape, strides=strides, device=device, deleter=lambda *_, owner=values: None
-    )
+    dtype, address = wp.dtype_from_numpy(np.dtype(described["typestr"])), described["data"][0]
+    return view_memory(address, dtype, described["shape"], device, values, described.get("strides"))
 
 
 def is_device_array(values) -> bool:
@@ -86,9 +84,7 @@ def to_numpy(values, what: str) -> np.ndarray:
     try:
         if isinstance(values, list | tuple | np.ndarray):
             pass
-        elif isinstance(values, wp.array):
-            values = values.numpy()
-        elif is_device_array(values):
+        elif isinstance(values, wp.array) or is_device_array(values):
             values = wrap_array(values, what).numpy()
         elif hasattr(values, "numpy"):
             values = (values.detach() if getattr(values, "requires_grad", False) else values).numpy()

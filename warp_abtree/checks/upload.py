@@ -19,6 +19,17 @@ def struct_of(struct, device, **values):
     return made
 
 
+def view_memory(pointer: int, dtype, shape: tuple, device="cpu", owner=None, strides=None) -> wp.array:
+    """Return a Warp array on memory that another object owns, which the array keeps alive."""
+    if 0 in shape:
+        return wp.empty(shape, dtype=dtype, device=device)
+
+    def keep(*_, owner=owner):
+        """Hold the owner until Warp calls this, when the last view goes."""
+
+    return wp.array(ptr=pointer, dtype=dtype, shape=shape, strides=strides, device=device, deleter=keep)
+
+
 def zeros_of(struct, rows, columns, device):
     """Return a struct of device arrays that are 0: `rows` entries each, or rows and columns."""
     made = struct()
@@ -39,7 +50,7 @@ class Download:
     def __init__(self, count: int, dtype, device):
         self._host = self.array = wp.zeros(count, dtype=dtype, device="cpu", pinned=device.is_cuda)
         if device.is_cuda:
-            self.array = wp.array(ptr=self._host.ptr, dtype=dtype, shape=count, device=device)
+            self.array = view_memory(self._host.ptr, dtype, (count,), device, self._host)
         self.view = self._host.numpy()
 
 

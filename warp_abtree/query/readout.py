@@ -2,6 +2,7 @@
 
 from contextlib import nullcontext
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any
 from weakref import proxy
 
@@ -10,12 +11,13 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, flag
 from warp_abtree.checks.regime import current_regime
+from warp_abtree.checks.upload import view_memory
 from warp_abtree.kernels.io import results as kernels
 from warp_abtree.kernels.search.make_slabs import make_slab_kernel
 from warp_abtree.query.request import APART_FOR_UNCERTAIN
 from warp_abtree.query.result import COUNTERS, Found, Result, Totals
 from warp_abtree.query.sorting import HitSort, first_sort, sort_rows
-from warp_abtree.query.staging import Staging, first_rows, view_memory
+from warp_abtree.query.staging import Staging, first_rows
 
 # Rows that are expected come in steps.
 ROWS_STEP = 1024
@@ -33,18 +35,6 @@ def operator_kernels(device, stages, output: str) -> list:
     if regime.packs(device):
         found += [(kernels.pack_pair_kernel, kernels.BLOCK_DIM), *(first_sort(device) if output == "faces" else [])]
     return found
-
-
-class HostViews:
-    """NumPy's views of an operator's arrays, where these are the host's memory."""
-
-    def __init__(self, operator: Any):
-        self.pairs = operator.pairs.numpy().reshape(-1, 2)
-        self.pair_count = operator.pair_count.numpy()
-        self.any_hit = operator.hits.any_hit.numpy()
-        self.near_hit = None if operator.near is None else operator.near.any_hit.numpy()
-        self.counts = operator.counts.numpy()
-        self.faces = operator.hits.face.numpy().reshape(-1, 3)
 
 
 class Readout:
@@ -73,9 +63,17 @@ class Readout:
         return HitSort(self.operator)
 
     @cached_property
-    def views(self) -> HostViews:
-        """Return views of the arrays on the CPU."""
-        return HostViews(self.operator)
+    def views(self) -> SimpleNamespace:
+        """Return NumPy's views of the operator's arrays, where these are the host's memory."""
+        operator, hits = self.operator, self.operator.hits
+        return SimpleNamespace(
+            pairs=operator.pairs.numpy().reshape(-1, 2),
+            pair_count=operator.pair_count.numpy(),
+            any_hit=hits.any_hit.numpy(),
+            near_hit=None if operator.near is None else operator.near.any_hit.numpy(),
+            counts=operator.counts.numpy(),
+            faces=hits.face.numpy().reshape(-1, 3),
+        )
 
     def link(self):
         """Take note of new arrays."""
@@ -216,7 +214,7 @@ class Readout:
         totals = self.totals(self.staging.fetch_words(self._pack_pairs(n, block), HEADER))
 
         def part(at, dtype):
-            return view_memory(block.ptr + at, dtype, n, self.device, block)
+            return view_memory(block.ptr + at, dtype, (n,), self.device, block)
 
         column, words = 8 * n, [part(8 * HEADER + 8 * n * k, wp.int64) for k in range(COLUMNS)]
         flags = 8 * HEADER + column * COLUMNS

@@ -5,6 +5,8 @@ import os
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.upload import view_memory
+
 # Blocks that a reader lends at a time: the result of a loop's last round lives until the next one takes its name.
 LENT_MAX = 2
 # Bytes that a pool keeps page-locked, a fraction of the machine's memory at most, and the least block.
@@ -13,13 +15,6 @@ PINNED_MAX, PINNED_FRACTION, BLOCK_LEAST = 2**32, 1 / 8, 2**16
 PINNED_AT_ONCE = 2**20
 # Bytes of device memory in which rows are packed, as often as it takes.
 PACKED_AT_ONCE = 2**26
-
-
-def view_memory(pointer: int, dtype, count: int, device="cpu", owner=None) -> wp.array:
-    """Return a Warp array on memory that another object owns, which the array keeps alive."""
-    if count == 0:
-        return wp.empty(0, dtype=dtype, device=device)
-    return wp.array(ptr=pointer, dtype=dtype, shape=(count,), device=device, deleter=lambda *_, owner=owner: None)
 
 
 def first_rows(array: wp.array, count: int) -> wp.array:
@@ -49,7 +44,7 @@ class _Block:
         """Return as many entries of a type as there is room for."""
         if dtype not in self._views:
             count = len(self) // wp.types.type_size_in_bytes(dtype)
-            self._views[dtype] = view_memory(self.words.ptr, dtype, count, owner=self.words)
+            self._views[dtype] = view_memory(self.words.ptr, dtype, (count,), owner=self.words)
         return self._views[dtype]
 
 
@@ -69,7 +64,7 @@ def _start_of(memory: np.ndarray, dtype, count: int) -> wp.array:
     """Return a Warp array on the start of host memory, as `HostPool` lends it or a part of that."""
     if isinstance(memory.base, _Lease):
         return memory.base.block.view(dtype)
-    return view_memory(memory.ctypes.data, dtype, count)
+    return view_memory(memory.ctypes.data, dtype, (count,))
 
 
 class HostPool:
@@ -161,7 +156,7 @@ class Staging:
         for first in range(0, count, at_once):
             some = min(at_once, count - first)
             pack(first, some, packed)
-            target = view_memory(memory.ctypes.data + first * size, wp.uint8, some * size)
+            target = view_memory(memory.ctypes.data + first * size, wp.uint8, (some * size,))
             wp.copy(target, packed, count=some * size)
         return memory[: count * size].view(dtype), memory[count * size :]
 

@@ -20,10 +20,10 @@ from warp_abtree.query.stages.distance import DistanceQuery, check_beyond, check
 from warp_abtree.query.stages.intersect import Query
 from warp_abtree.query.stages.motion import FirstContactQuery, HalfTurnError
 from warp_abtree.scene.scene import Scene
-from warp_abtree.scene.sweep_poses import PoseSlot, find_copy_stream, refuse_row, take_rows
+from warp_abtree.scene.sweep_poses import PoseSlot, find_copy_stream, take_rows
 from warp_abtree.state.arrays import ObjectArrays
 from warp_abtree.state.batch import Batch
-from warp_abtree.state.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
+from warp_abtree.state.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE, raise_bad_pose
 
 # Poses of a launch: enough to fill a GPU, few enough that millions need no more memory; fewer where few are given.
 CHUNKS = (1024, 8192, 65536)
@@ -47,7 +47,6 @@ class _PosedModels:
     """A pair of models on a device, and chunks of several sizes, each made when first needed."""
 
     def __init__(self, pair: Scene, owners):
-        self.device = pair.device
         self.owners = owners  # weak, and taken out of what is kept when a model goes
         self.batch = pair.batch()
         self.chunks: dict[int, _Chunk] = {}
@@ -65,7 +64,7 @@ class _Chunk:
 
     def __init__(self, posed: _PosedModels, room):
         pair, self.room = posed.batch, room
-        objects = ObjectArrays(np.zeros(room + 1), np.zeros(room + 1), posed.device)
+        objects = ObjectArrays(np.zeros(room + 1), np.zeros(room + 1), pair.device)
         objects.set_states(np.repeat(pair.objects.state, [1, room]))
         objects.pool.rotation[:1].assign(np.eye(3)[None])
         solid = () if pair.solids is None else np.repeat(pair.solids.is_solid, [1, room])
@@ -161,17 +160,14 @@ class _ChunkQuery:
             wp.synchronize_event(slot.done)
         refused, uncertain = slot.report_host.numpy().tolist()
         if refused != NONE_REFUSED:
-            refuse_row(poses, start + refused)
-        if uncertain % 2**32 > slot.uncertain_room:  # which may have grown since
-            return getattr(self._run_grown(slot, count), self.output)
-        return slot.answer_host.numpy()[:count]
-
-    def _run_grown(self, slot, count):
-        """Query the poses in a slot, with buffers that grow as needed. Waits for the device."""
+            raise_bad_pose(poses.row(start + refused), start + refused)
+        if uncertain % 2**32 <= slot.uncertain_room:
+            return slot.answer_host.numpy()[:count]
+        # Room may have grown since: asked again, with room as needed.
         self.query.ask_pairs(self.pairs[:count])
         self.count = count
         self._place(slot)
-        return self.query.run()
+        return getattr(self.query.run(), self.output)
 
     def find_answers(self, poses):
         """Return "any" or "count" of all poses."""
@@ -210,7 +206,7 @@ class _ChunkQuery:
                 self._place(slot, objects)
                 refused = int(slot.report.numpy()[0])
                 if refused != NONE_REFUSED:
-                    refuse_row(rows, start + refused, what)
+                    raise_bad_pose(rows.row(start + refused), start + refused, what)
             self.query.ask_pairs(self.pairs[:count], **distances)
             try:
                 result = self.query.run()

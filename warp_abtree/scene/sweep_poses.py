@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import to_numpy
-from warp_abtree.state.poses import check_poses, device_rows
+from warp_abtree.state.poses import device_rows, pose_width
 
 SCALARS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
 
@@ -35,17 +35,11 @@ def take_rows(poses, device, what="poses"):
     rows = to_numpy(poses, what)
     if rows.shape == (0,):
         rows = np.empty((0, 7))
-    if not (rows.ndim == 2 and rows.shape[1] == 7) and not (rows.ndim == 3 and rows.shape[1:] == (4, 4)):
+    width = pose_width(rows.shape)
+    if width is None:
         raise ValueError(f"{what}: shape {rows.shape} is neither (p, 7) nor (p, 4, 4)")
-    rows = rows.reshape(len(rows), 7 if rows.ndim == 2 else 16)
+    rows = rows.reshape(len(rows), width)
     return PoseRows(rows if rows.dtype in SCALARS else rows.astype(np.float64))
-
-
-def refuse_row(poses, i, what="poses"):
-    """Raise ValueError about row i, which is no pose."""
-    row = np.asarray(poses.row(i), np.float64)
-    check_poses(row[None] if poses.width == 7 else row.reshape(1, 4, 4), what, first=i)
-    raise ValueError(f"{what}: pose {i} is no pose")  # by rounding, where the host finds it just within
 
 
 @functools.cache

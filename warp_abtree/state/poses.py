@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import is_device_array, to_numpy, wrap_array
+from warp_abtree.checks.upload import view_memory
 from warp_abtree.kernels.io import place_poses
 
 QUATERNION_TOLERANCE = 1e-3
@@ -14,7 +15,6 @@ ANY_NORM = 1e308
 # A matrix that is no farther off was rigid before rounding, for all that its numbers tell.
 ROUNDED_AT_MOST = 1e-2
 
-REALS = (wp.float32, wp.float64)
 # Warp's types of a pose, their numbers, and how many.
 POSE_TYPES = {
     wp.transformf: (wp.float32, 7),
@@ -25,6 +25,11 @@ POSE_TYPES = {
 NONE_BAD = 2**31 - 1
 IDENTITY_POSE = (0, 0, 0, 0, 0, 0, 1)
 IDENTITY, LAST_ROW = np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def pose_width(shape: tuple) -> int | None:
+    """Return how many numbers a pose has in an array of this shape, 7 or 16; None where it holds no poses."""
+    return {(7,): 7, (4, 4): 16}.get(tuple(shape[1:]))
 
 
 def check_poses(poses, what="poses", first=0, removed=()) -> np.ndarray:
@@ -39,7 +44,7 @@ def check_poses(poses, what="poses", first=0, removed=()) -> np.ndarray:
             matrix that is not rigid within 1e-6.
     """
     poses = to_numpy(poses, what)
-    if not (poses.ndim == 2 and poses.shape[1] == 7) and not (poses.ndim == 3 and poses.shape[1:] == (4, 4)):
+    if pose_width(poses.shape) is None:
         raise ValueError(f"{what}: shape {poses.shape} is neither (n, 7) nor (n, 4, 4)")
     poses = poses.astype(np.float64)
     if len(removed) and len(poses) > removed[-1]:
@@ -98,11 +103,8 @@ def view_rows(array: wp.array):
     if array.ndim == 1 and array.dtype in POSE_TYPES:
         scalar, width = POSE_TYPES[array.dtype]
         array = array if array.is_contiguous else array.contiguous()
-        at = {"ptr": array.ptr, "shape": (len(array), width), "device": array.device}
-        # The deleter holds the owner of the memory until the rows go.
-        return wp.array(dtype=scalar, deleter=lambda *_, owner=array: None, **at)
-    quaternions = array.ndim == 2 and array.shape[1] == 7
-    if array.dtype not in REALS or not (quaternions or array.shape[1:] == (4, 4)):
+        return view_memory(array.ptr, scalar, (len(array), width), array.device, array)
+    if array.dtype not in (wp.float32, wp.float64) or pose_width(array.shape) is None:
         return None
     array = array if array.is_contiguous else array.contiguous()
     return array if array.ndim == 2 else array.reshape((array.shape[0], 16))
@@ -117,19 +119,22 @@ def place_rows(rows, pool, tolerance=QUATERNION_TOLERANCE):
     Raises:
         ValueError: As `check_poses`; nothing is changed.
     """
-    matrices = rows.shape[1] == 16
     first = wp.full(1, NONE_BAD, dtype=wp.int32, device=rows.device)
-    inputs = [wp.float64(RIGID_TOLERANCE if matrices else tolerance), rows, first]
+    inputs = [wp.float64(RIGID_TOLERANCE if rows.shape[1] == 16 else tolerance), rows, first]
     wp.launch(place_poses.pose_check(rows.dtype, rows.shape[1]), len(rows), inputs, device=rows.device)
     bad = int(first.numpy()[0])
     if bad != NONE_BAD:
-        row = rows[bad : bad + 1].numpy()
-        check_poses(row.reshape(1, 4, 4) if matrices else row, first=bad)
-        raise ValueError(f"poses: pose {bad} is no pose")  # by rounding, where the host finds it just within
+        raise_bad_pose(rows[bad : bad + 1].numpy(), bad)
     launch_place(rows, pool)
     # Whose memory it is may free or change it as soon as this returns, on another stream.
     if rows.device.is_cuda:
         wp.synchronize_stream(wp.get_stream(rows.device))
+
+
+def raise_bad_pose(row: np.ndarray, i: int, what="poses"):
+    """Raise ValueError about pose i, a row of 7 or 16 numbers that the device has refused."""
+    check_poses(row.reshape((1, 7) if row.size == 7 else (1, 4, 4)), what, first=i)
+    raise ValueError(f"{what}: pose {i} is no pose")  # by rounding, where the host finds it just within
 
 
 class PoseSetter:
