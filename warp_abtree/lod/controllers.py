@@ -287,15 +287,11 @@ class PredictiveController(Controller):
         self._told = Download(6, wp.float64, self.device)  # the choice, for the host
         self.scale, self.offset = self._zeros(2, wp.int32), self._zeros(count, wp.int32)
         self.level = self._zeros(count, wp.int32)
-        self.chosen = self._make_chosen()
+        of_objects = {"scale": self.scale, "choice": self.choice, "offset": self.offset, "level": self.level}
+        held = len(self.changes) - 1
+        self.chosen = struct_of(prediction.LevelChoice, self.device, held=held, lods=self.pool, **of_objects)
         self._query, self._refine, self._rest = CostFit(), CostFit(), CostFit()
         self._exponent, self._drift = 1.0, 0.0
-
-    def _make_chosen(self):
-        made = prediction.LevelChoice()
-        made.held, made.lods = len(self.changes) - 1, self.pool
-        made.scale, made.choice, made.offset, made.level = self.scale, self.choice, self.offset, self.level
-        return made
 
     def _limits(self):
         made = prediction.Limits()

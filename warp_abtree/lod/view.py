@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import finite_array, positive, whole_number
-from warp_abtree.checks.upload import Upload
+from warp_abtree.checks.upload import Upload, struct_of
 from warp_abtree.kernels.lod import view as kernels
 
 AXES = {f"{sign}{name}": f * axis for sign, f in (("", 1), ("-", -1)) for name, axis in zip("xyz", np.eye(3))}
@@ -107,22 +107,23 @@ class View:
     def __init__(self, scene, window: int = 10):
         self.scene = scene
         self.window = whole_number(window, "window", 1, 1000)
-        self.batch = scene.batch()
-        self.device, count = scene.device, scene.object_count
-
-        def zeros(length, dtype=wp.float64):
-            return wp.zeros(length, dtype=dtype, device=self.device)
-
-        self.distance, self.motion = zeros(count), zeros(count)
-        self.focus = wp.full(count, 1.0, dtype=wp.float64, device=self.device)
-        self.arrays = kernels.ViewArrays()
-        self.arrays.window = self.window
-        self.arrays.object_model = wp.array(np.array(scene.object_model, np.int32), dtype=wp.int32, device=self.device)
-        self.arrays.centre = self.batch.models.pool.centre
-        self._camera = Upload(15, self.device)
-        self.arrays.camera, self.arrays.frame = self._camera.array, zeros(count, wp.int32)
-        self.arrays.screen, self.arrays.path = zeros(count, wp.vec3d), zeros(self.window * count)
-        self.arrays.distance, self.arrays.motion, self.arrays.focus = self.distance, self.motion, self.focus
+        self.batch, self.device = scene.batch(), scene.device
+        self._camera, count = Upload(15, self.device), scene.object_count
+        self.arrays = struct_of(
+            kernels.ViewArrays,
+            self.device,
+            window=self.window,
+            object_model=scene.object_model,
+            centre=self.batch.models.pool.centre,
+            camera=self._camera.array,
+            frame=np.zeros(count),
+            screen=np.zeros((count, 3)),
+            path=np.zeros(self.window * count),
+            distance=np.zeros(count),
+            motion=np.zeros(count),
+            focus=np.ones(count),
+        )
+        self.distance, self.motion, self.focus = self.arrays.distance, self.arrays.motion, self.arrays.focus
 
     def look(self, camera: Camera):
         """Set the camera from the next launch on; a captured graph reads it at every launch."""

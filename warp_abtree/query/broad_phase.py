@@ -12,6 +12,7 @@ from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.radix_sort import radix_sort
 from warp_abtree.checks.regime import current_regime
+from warp_abtree.checks.upload import struct_of
 from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.intersect import box_sweep, box_tiles
 from warp_abtree.kernels.intersect import broad_phase as kernels
@@ -26,7 +27,7 @@ SORTED_TASKS = 2**20
 # Warps that share the objects of a tile at most, and all warps then; of sorted objects, of which most find nothing.
 # Each waits for one object after the other. Of one task they would find pairs in an order that changes.
 SHARING_WARPS, WARPS_AT_ONCE, SORTED_WARPS = 8, 2**13, 2**15
-# Launches before the sort: boxes, their bounds, and keys.
+# Launches before a sort of objects: boxes, their bounds, and keys.
 SORT_AFTER = 3
 
 
@@ -117,8 +118,7 @@ class TileSearch:
         self._key_bits = box_tiles.CURVE_BITS + int(group.max(initial=0)).bit_length()
         self._tile_count = len(others)
         boxed = self._tile_count if self.sorts else 0
-        self.tiles.lower = wp.empty(boxed, dtype=wp.vec3, device=self.device)
-        self.tiles.upper = wp.empty(boxed, dtype=wp.vec3, device=self.device)
+        self.tiles.lower, self.tiles.upper = (wp.empty(boxed, dtype=wp.vec3, device=self.device) for _ in range(2))
         if self.in_order:
             starts = np.concatenate([[0], np.cumsum(others)])
             self.tiles.place = wp.array(np.argsort(order), dtype=wp.int32, device=self.device)
@@ -150,16 +150,8 @@ class TileSearch:
             made.append(launch(box_tiles.list_tile_pair_kernel, dim=self._lanes * count, inputs=inputs, **warps))
         return made
 
-    def launch(self, launches: list):
-        """Launch what boxes the objects, and what `make` made, with a sort between them."""
-        for launch in launches[:SORT_AFTER]:
-            launch()
-        if self.sorts:
-            self._sort()
-        for launch in launches[SORT_AFTER:]:
-            launch()
-
-    def _sort(self):
+    def sort(self):
+        """Sort the objects along the curve. Launches only."""
         radix_sort(self._key, self.tiles.order, len(self._key) // 2, self._key_bits)
 
 
@@ -173,25 +165,22 @@ class SweepSearch:
     in_order = False
 
     def __init__(self, broad_phase: "BroadPhase", group: np.ndarray):
-        self._broad_phase, self.sweep, count = proxy(broad_phase), box_sweep.Sweep(), len(group)
-        starts = np.concatenate([[0], np.cumsum(np.bincount(group))])
-        self.sweep.start = wp.array(starts, dtype=wp.int32, device="cpu")
-        self.sweep.order = wp.array(np.argsort(group, kind="stable"), dtype=wp.int32, device="cpu")
-        self.sweep.place = wp.empty(count, dtype=wp.int32, device="cpu")
-        self.sweep.rows = wp.zeros(6 * (count + 16), dtype=wp.float32, device="cpu")
-        self.sweep.words = wp.empty(2 * count, dtype=wp.int64, device="cpu")
+        self._broad_phase, count = proxy(broad_phase), len(group)
+        self.sweep = struct_of(
+            box_sweep.Sweep,
+            "cpu",
+            start=np.concatenate([[0], np.cumsum(np.bincount(group))]),
+            order=np.argsort(group, kind="stable"),
+            place=np.zeros(count),
+            rows=np.zeros(6 * (count + 16)),
+            words=np.zeros(2 * count),
+        )
 
     def make(self, launch) -> list:
         """Make the launch that finds pairs of boxes."""
         found = self._broad_phase
         inputs = [found.filter, self.sweep, found.batch.objects.pool, found.bounds, found.pairs]
         return [launch(box_sweep.sweep_pair_kernel, dim=1, inputs=inputs, device=found.device)]
-
-    @staticmethod
-    def launch(launches: list):
-        """Launch what boxes the objects, and what `make` made."""
-        for launch in launches:
-            launch()
 
 
 class BroadPhase(DeviceMemory):
@@ -210,6 +199,8 @@ class BroadPhase(DeviceMemory):
             greatest int64.
         boxes: As given.
         bounds: Boxes of the last launch, `kernels.intersect.broad_phase.PosedBounds`.
+        lower, upper: Ends of these boxes, device vec3 (n,).
+        pair_count: How many pairs were found, device int32 (1,); it keeps counting past the capacity.
         filter: Which objects may be a pair, `kernels.intersect.broad_phase.PairFilter`.
     """
 
@@ -226,34 +217,17 @@ class BroadPhase(DeviceMemory):
         # What is in every world comes first.
         names, inverse = np.unique(worlds, return_inverse=True)
         group: np.ndarray = inverse.astype(np.int32).reshape(-1)
-        self.filter, self.bounds = kernels.PairFilter(), kernels.PosedBounds()
-        self.filter.shared_group = 0 if len(names) and names[0] == EVERY_WORLD else -1
-        self.filter.group = wp.array(group, dtype=wp.int32, device=device)
-        self.filter.excluded = wp.array(batch.excluded, dtype=wp.int64, device=device)
-        self.filter.collision_bits = batch.objects.collision_bits
-        self.bounds.lower = wp.zeros(count, dtype=wp.vec3, device=device)
-        self.bounds.upper = wp.zeros(count, dtype=wp.vec3, device=device)
-        self.bounds.pair_count = wp.zeros(1, dtype=wp.int32, device=device)
+        shared, bits = 0 if len(names) and names[0] == EVERY_WORLD else -1, batch.objects.collision_bits
+        given = {"shared_group": shared, "group": group, "excluded": batch.excluded, "collision_bits": bits}
+        self.filter = struct_of(kernels.PairFilter, device, **given)
+        corners = np.zeros((count, 3))
+        self.bounds = struct_of(kernels.PosedBounds, device, lower=corners, upper=corners, pair_count=[0])
+        self.lower, self.upper, self.pair_count = self.bounds.lower, self.bounds.upper, self.bounds.pair_count
         self.guard = guard or LaunchGuard(device, batch.states.generation, batch.filter_generation)
         self._commands = Commands()
         self.search: TileSearch | SweepSearch
         self.search = (TileSearch if current_regime().uses_warps(device) else SweepSearch)(self, group)
         self.resize(capacity or max(64, 4 * count))
-
-    @property
-    def lower(self) -> wp.array:
-        """Return the lower ends of the boxes, device vec3 (n,)."""
-        return self.bounds.lower
-
-    @property
-    def upper(self) -> wp.array:
-        """Return the upper ends of the boxes, device vec3 (n,)."""
-        return self.bounds.upper
-
-    @property
-    def pair_count(self) -> wp.array:
-        """Return how many pairs were found, device int32 (1,); it keeps counting past the capacity."""
-        return self.bounds.pair_count
 
     def resize(self, capacity: int):
         """Make room for a number of pairs."""
@@ -274,7 +248,13 @@ class BroadPhase(DeviceMemory):
     def launch(self):
         """Box, search, and sort if asked. Launches only, so that a graph can capture it."""
         given = *self.guard.given(), self.pairs.ptr, self.boxes.given()
-        self.search.launch(self._commands.find_callables("pairs", given, self.device, self._make_launches))
+        launches = self._commands.find_callables("pairs", given, self.device, self._make_launches)
+        for launch in launches[:SORT_AFTER]:
+            launch()
+        if isinstance(self.search, TileSearch) and self.search.sorts:
+            self.search.sort()
+        for launch in launches[SORT_AFTER:]:
+            launch()
         if self.sorts and not self.search.in_order:
             self._sort()
 
@@ -292,20 +272,12 @@ class BroadPhase(DeviceMemory):
         return [self.boxes.make(launch, self.guard, self.bounds), *self.search.make(launch)]
 
     def count_found(self) -> int:
-        """Return how many pairs the last launch found. Waits for the device.
-
-        Raises:
-            CapacityError: 2^31 pairs or more.
-        """
+        """Return how many pairs the last launch found; raise CapacityError for 2^31 or more. Waits for the device."""
         return self.check_found(int(self.pair_count.numpy()[0]))
 
     @staticmethod
     def check_found(found: int) -> int:
-        """Return a number of pairs found.
-
-        Raises:
-            CapacityError: 2^31 pairs or more.
-        """
+        """Return a number of pairs found; raise CapacityError for 2^31 or more."""
         if found < 0:
             raise CapacityError("the broad phase found 2^31 object pairs or more; use more worlds or fewer objects")
         return found
