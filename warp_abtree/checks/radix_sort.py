@@ -12,11 +12,8 @@ SORT_ATTEMPTS = 4  # on a busy GPU one of some thousand sorts fails
 def radix_sort(keys: wp.array, values: wp.array, count: int, bits: int):
     """Sort the first numbers of an array by so many low bits, and values with them, in place. Launches only.
 
-    Args:
-        keys, values: (2 count,) or more; what lies behind the first count is scratch.
-
-    Raises:
-        RuntimeError: Warp did not sort them, several times.
+    `keys` and `values` have 2 count entries or more; what lies behind the first count is scratch. Raises RuntimeError
+    where Warp did not sort them several times.
     """
     for _ in range(SORT_ATTEMPTS):
         ctypes.memset(_error_address(), 0, 1)

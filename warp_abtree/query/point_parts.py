@@ -70,10 +70,6 @@ class PointParts:
         # Its pairs are written on the device.
         self.operator = Operator(query.batch, stages, np.empty((0, 2), np.int32), rooms, "faces")
 
-    def list_rooms(self) -> dict[str, int]:
-        """Return the room of the lists by name."""
-        return {name: getattr(self.operator.rooms, name) for name in ("hits", "uncertain")}
-
     def fit_states(self) -> bool:
         """Make room for tree states that are new; return whether the lists are others than were lent last."""
         self.operator.fit_states()

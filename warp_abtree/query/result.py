@@ -25,8 +25,7 @@ VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
 def contact_dtypes(dtype=np.float64, with_gap=False):
     """Return the types of `Result.contacts` and `Result.pair_contacts`, real numbers of a type inside.
 
-    Raises:
-        ValueError: The type is neither float32 nor float64.
+    Raises ValueError for another type than float32 and float64.
     """
     try:
         real = np.dtype(dtype)

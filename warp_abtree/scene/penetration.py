@@ -53,7 +53,7 @@ class Penetration:
 def check_directions(directions) -> np.ndarray:
     """Return directions (m, 3) or (p, m, 3) as unit vectors, float64 (1, m, 3) or (p, m, 3); refuse what is none."""
     given = to_numpy(directions, "directions")
-    if given.ndim not in (2, 3) or given.shape[-1] != 3 or not given.shape[-2] or given.dtype.kind not in "iuf":
+    if given.ndim not in (2, 3) or given.shape[-1] != 3 or not given.shape[-2]:
         raise ValueError(
             f"directions: shape {given.shape} and type {given.dtype}, not numbers of shape (m, 3) or (p, m, 3), m > 0"
         )

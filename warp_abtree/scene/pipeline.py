@@ -25,8 +25,7 @@ from warp_abtree.state.poses import QUATERNION_TOLERANCE
 def check_groups(groups, object_model) -> np.ndarray:
     """Return the group of each object, int (n,).
 
-    Raises:
-        ValueError: Wrong shape, a number from 0 on that no object has, or a group of several models.
+    Raises ValueError for a wrong shape, a number from 0 on that no object has, and a group of several models.
     """
     groups = to_numpy(groups, "groups")
     if groups.shape != object_model.shape or groups.dtype.kind not in "iu":
@@ -41,11 +40,7 @@ def check_groups(groups, object_model) -> np.ndarray:
 
 
 def check_ladder(ladder, models) -> list:
-    """Return the levels of each model, rising int arrays.
-
-    Raises:
-        ValueError: Not one list a model, an empty one, or a LOD out of range.
-    """
+    """Return the levels of each model, rising int arrays; raise ValueError for bad ones, or not one list a model."""
     parts = [list(part) for part in ladder]
     if len(parts) != len(models):
         raise ValueError(f"ladder: {len(parts)} lists of LODs given for {len(models)} models")
@@ -111,10 +106,17 @@ class Pipeline(DeviceMemory):
         self.device = batch.device
         if groups is not None and ladder is not None:
             raise ValueError("groups and ladder: give one of them; with a ladder objects share states anyway")
+        model, lods = batch.object_model, scene.lods
+        self._update: DeviceLodUpdate | LevelStates
         if ladder is None:
-            self._update = self._own_states(scene.lods, groups)
+            group = np.arange(len(lods)) if groups is None else check_groups(groups, model)
+            first = np.unique(group, return_index=True)[1]
+            batch.replace_states(list(zip(model[first].tolist(), lods[first].tolist())), group)
+            self._update = DeviceLodUpdate(batch.models, batch.states, takes_any=group[batch.removed])
         else:
-            self._update = self._make_ladder(scene.lods, ladder, scene.models)
+            levels = check_ladder(ladder, scene.models)
+            last = np.array([part[-1] for part in levels])[model]
+            self._update = LevelStates(batch, levels, np.minimum(lods, last))
         self.lods = self._update.wanted
         self._levels = self._update.levels if isinstance(self._update, LevelStates) else Levels()
         plan = self._update.plan
@@ -130,20 +132,6 @@ class Pipeline(DeviceMemory):
         self.launch()
         self._fit_uncertain(request.get("capacity"))
         self.clear_faults()
-
-    def _own_states(self, lods, groups):
-        """Make a state an object or group."""
-        batch, object_model = self.batch, self.batch.object_model
-        group = np.arange(len(lods)) if groups is None else check_groups(groups, object_model)
-        first = np.unique(group, return_index=True)[1]
-        batch.replace_states(list(zip(object_model[first].tolist(), lods[first].tolist())), group)
-        return DeviceLodUpdate(batch.models, batch.states, takes_any=group[batch.removed])
-
-    def _make_ladder(self, lods, ladder, models):
-        """Make a state a model and level."""
-        levels = check_ladder(ladder, models)
-        last = np.array([part[-1] for part in levels])[self.batch.object_model]
-        return LevelStates(self.batch, levels, np.minimum(lods, last))
 
     def _fit_uncertain(self, capacity):
         """Make room for the uncertain face pairs, unless that room was given; then say what it lacks."""
@@ -238,6 +226,7 @@ class Pipeline(DeviceMemory):
         poses, lods, demand = self._bad_poses.numpy().copy(), self._update.faults.numpy().copy(), self._read_demand()
         found, hits, uncertain, stale = (int(value) for value in demand[:4])
         self.clear_faults()
+        stale_frame = [f"a frame since the last check is lost: its graph {STALE_GRAPH}"] if stale else []
         wrong, lost = [], []
         if poses[0]:
             wrong.append(
@@ -258,10 +247,6 @@ class Pipeline(DeviceMemory):
             if needs > places:
                 needed = f"Buffers({name}={needs})"
                 lost.append(f"a frame since the last check needed {needed}, the pipeline has room for {places}")
-        if stale:
-            stale_frame = f"a frame since the last check is lost: its graph {STALE_GRAPH}"
-            raise RuntimeError("; ".join([stale_frame, *lost, *wrong]))
-        if lost:
-            raise CapacityError("; ".join([*lost, *wrong]))
-        if wrong:
-            raise ValueError("; ".join(wrong))
+        if stale_frame or lost or wrong:
+            kind = RuntimeError if stale_frame else CapacityError if lost else ValueError
+            raise kind("; ".join([*stale_frame, *lost, *wrong]))

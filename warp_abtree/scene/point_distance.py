@@ -147,7 +147,7 @@ def _bound_on_host(points, device) -> tuple:
     points = to_numpy(points, "points")
     if points.shape == (0,):
         points = np.empty((0, 3))
-    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "iuf":
+    if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points: shape {points.shape} and type {points.dtype}, not numbers of shape (n, 3)")
     points = np.ascontiguousarray(points, np.float64)
     if not np.abs(points).max(initial=0.0) <= COORDINATE_MAX:

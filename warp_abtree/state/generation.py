@@ -165,13 +165,9 @@ class LaunchGuard:
         return int((self.launched.numpy() if self._view is None else self._view)[0])
 
     def check(self, launched: int):
-        """Raise where the results are not of a whole launch on the arrays in use.
+        """Raise RuntimeError where nothing was launched, a launch was interrupted, or it was of a stale graph.
 
-        Args:
-            launched: First entry of the array of this name, as it was read.
-
-        Raises:
-            RuntimeError: Nothing was launched, or a launch was interrupted, or it was of a stale graph.
+        `launched` is the first entry of the array of this name, as it was read.
         """
         if launched != self.buffers.number:
             why = FAILED_LAUNCHES.get(launched, "buffers were replaced since the last launch; launch again")

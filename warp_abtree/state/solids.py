@@ -56,8 +56,7 @@ class SolidArrays:
     def fit(self):
         """Make room for the components of all tree states that there are now.
 
-        Raises:
-            RuntimeError: It takes room, and a graph is being captured; or the device is out of memory.
+        Raises RuntimeError where that takes room and a graph is being captured, or the device is out of memory.
         """
         slots = [slot.model for slot in self.states.slots]
         if slots == self._slot_models:

@@ -121,15 +121,13 @@ class ContactStage(Stage):
         return [*((kernel, WARP_SIZE) for kernel in finding), *first_sort(device)]
 
     def arrays(self, rooms: Rooms) -> list[Array]:
-        """Return what has an entry a contact, a pair or a chunk of contacts.
-
-        Raises:
-            CapacityError: 2^30 contacts or more.
-        """
+        """Return what has an entry a contact, a pair or a chunk of contacts; raise CapacityError for 2^30 contacts."""
         hits, pairs = rooms.hits, rooms.pairs
         if hits >= 2**30:
             raise CapacityError(f"{hits} face pairs asked, a contact query has room for fewer than 2^30")
-        made = [
+        means = {"point": wp.vec3d, "normal": wp.vec3d}
+        sums = {"span": wp.vec3i, "length": wp.float64, "crossed": wp.float64, **means}
+        return [
             Array(self, "faces", wp.vec3i, hits),
             *fields(self.contacts, hits, **dict.fromkeys(VECTORS, wp.vec3d), coplanar=wp.int32),
             Array(self.deferred, "place", wp.int32, hits),
@@ -137,16 +135,9 @@ class ContactStage(Stage):
             Array(self, "key", wp.int64, 2 * hits),
             Array(self, "order", wp.int32, 2 * hits),
             Array(self, "start", wp.int32, pairs + 1, 0),
-            *fields(self.pair_contacts, pairs, point=wp.vec3d, normal=wp.vec3d),
-        ]
-        if self._with_gap:
-            made.append(Array(self.contacts, "separation", wp.float64, hits))
-        count = self._chunk_count(hits, pairs)
-        return [
-            *made,
-            *fields(
-                self._sums, count, span=wp.vec3i, length=wp.float64, crossed=wp.float64, point=wp.vec3d, normal=wp.vec3d
-            ),
+            *fields(self.pair_contacts, pairs, **means),
+            *([Array(self.contacts, "separation", wp.float64, hits)] if self._with_gap else []),
+            *fields(self._sums, self._chunk_count(hits, pairs), **sums),
         ]
 
     def link(self):
@@ -293,10 +284,8 @@ class ContactStage(Stage):
 def plan_contacts(precision, within, gap, sums: bool, dtype: Any = np.float64, memory=None) -> list[Stage]:
     """Return the stages that find contacts and their summaries, or those that are reduced to points.
 
-    memory is the stage that finds the pairs that rest, the gap itself if it knows, or None.
-
-    Raises:
-        ValueError: An unknown precision.
+    memory is the stage that finds the pairs that rest, the gap itself if it knows, or None. Raises ValueError for an
+    unknown precision.
     """
     check_request("faces", precision)
     slots = None if sums else SlotStage(gap is not None)
@@ -382,9 +371,5 @@ class ContactQuery(Operator):
         self._contacts.dtype = dtype
 
     def set_pairs(self, pairs, within=None, gap=None):
-        """Query other pairs from now on, in the room there is if they fit; within and gap None keep the distances.
-
-        Raises:
-            ValueError: Bad pairs or distances, a query that runs the broad phase, or distances for one made without.
-        """
+        """Query other pairs from now on, as `Query.set_pairs` does; within and gap None keep the distances."""
         self.ask_pairs(pairs, within=within, gap=gap)

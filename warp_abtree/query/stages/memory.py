@@ -20,8 +20,7 @@ POINT_TYPES |= {"shown": wp.int32}
 def check_remember(remember, gap) -> float | None:
     """Return how far points of a pair that rests may have moved, -1 for a part of its gap and size, None without.
 
-    Raises:
-        ValueError: Neither a bool nor a distance above 0, or no gap.
+    Raises ValueError for neither a bool nor a distance above 0, and without a gap.
     """
     on = isinstance(remember, bool | np.bool_)
     if remember is None or (on and not remember):

@@ -301,7 +301,7 @@ class ManifoldQuery(Operator):
     @property
     def list_rooms(self) -> Rooms:
         """Return the room of the lists that hits are found in, those of one part of the pairs at a time."""
-        return self.rooms if self.parts is None else self.rooms._replace(**self.parts.list_rooms())
+        return self.rooms if self.parts is None else Rooms(self.rooms.pairs, *self.parts.operator.rooms[1:])
 
     def make_list_room(self, hits=None, uncertain=None):
         """Make room for longer lists; long ones serve parts of the pairs in turn. Waits for the device."""
