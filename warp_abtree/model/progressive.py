@@ -19,6 +19,7 @@ from warp_abtree.model.cache import find_errors, keep_errors
 from warp_abtree.model.collapse import Collapse
 from warp_abtree.model.cpu_arrays import cpu_array, launch
 from warp_abtree.model.lod_bounds import ERROR_KERNELS, LodBounds, certify_errors
+from warp_abtree.model.winding import find_roots
 
 NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
 # Of all modules of a build, those first that take longest to compile; each is launched as a block of one thread.
@@ -101,12 +102,7 @@ class ProgressiveMesh:
         parent = self.vertex_parent[:limit]
         inner = (parent >= 0) & (parent < limit)
         node[inner] = parent[inner]
-        # pointer doubling: the forest's depth in its logarithm of rounds
-        while True:
-            above = node[node]
-            if np.array_equal(above, node):
-                return node[: self.vertex_count].copy()
-            node = above
+        return find_roots(node)[: self.vertex_count].copy()
 
     def mesh_at(self, lod):
         """Return the surface at a LOD: used vertices float64 [v, 3], faces int32 [f, 3], face ids int32 [f].

@@ -156,15 +156,20 @@ def component_labels(faces, vertex_count):
         lowest = corner_label.min(axis=1)
         for column in corner_label.T:
             np.minimum.at(label, column, lowest)
-        # Invariant: label[v] <= v, so jumping ends, at roots.
-        while True:
-            jumped = label[label]
-            if np.array_equal(jumped, label):
-                break
-            label = jumped
+        label = find_roots(label)  # there are some: label[v] <= v
         corner_label = label[pending]
         pending = pending[(corner_label != corner_label[:, :1]).any(axis=1)]
     return label
+
+
+def find_roots(above):
+    """Return the root over each node of a forest; `above` has the node over each, a root over itself."""
+    # Pointer doubling: the forest's depth in its logarithm of rounds.
+    while True:
+        further = above[above]
+        if np.array_equal(further, above):
+            return above
+        above = further
 
 
 def distinct_rows(rows):

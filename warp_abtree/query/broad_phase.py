@@ -18,6 +18,7 @@ from warp_abtree.kernels.intersect import box_sweep, box_tiles
 from warp_abtree.kernels.intersect import broad_phase as kernels
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.request import CapacityError
+from warp_abtree.query.sorting import sort_rows
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
 
@@ -294,7 +295,4 @@ class BroadPhase(DeviceMemory):
         if found > len(self.pairs):
             self.resize(found)
             self.launch()
-        # As numbers i * 2^32 + j they sort ten times as fast as by two keys.
-        first, second = self.pairs.numpy()[:found].reshape(-1, 2).astype(np.int64).T
-        keys = np.sort((first << 32) + second)
-        return np.stack([keys >> 32, keys & (2**32 - 1)], 1).astype(np.int32)
+        return sort_rows(self.pairs.numpy()[:found].reshape(-1, 2))

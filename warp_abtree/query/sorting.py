@@ -12,7 +12,7 @@ from warp_abtree.kernels.io import sort_hits, sort_segments
 from warp_abtree.query.staging import first_rows
 
 # Rows whose sorting takes longer than packing each into one number, which sorts 20 times as fast.
-ROWS_TO_PACK = 1000
+ROWS_TO_PACK = 400
 
 # Hits are sorted by a segment a pair up to so many pairs, whose starts each block sums anew, and up to so many hits a
 # pair on average, which a group of threads sorts by itself.
@@ -20,18 +20,18 @@ SEGMENTS_MOST, SEGMENT_LONGEST = 2**17, 2048
 
 
 def sort_rows(rows: np.ndarray) -> np.ndarray:
-    """Return rows of three int32 that are not negative, (k, 3), sorted by the first, the second and the third."""
+    """Return rows of int32 that are not negative, sorted by the first number, of equal ones by the next, and so on."""
     packs = len(rows) >= ROWS_TO_PACK
     widths = [int(column.max()).bit_length() for column in rows.T] if packs else []
     if not packs or sum(widths) > 63:
-        return rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))]
-    key = rows[:, 0].astype(np.int64)
-    for column in (1, 2):
+        return rows[np.lexsort(rows.T[::-1])]
+    key, others = rows[:, 0].astype(np.int64), range(1, len(widths))
+    for column in others:
         key <<= widths[column]
         key |= rows[:, column]
     key.sort()
     found = np.empty_like(rows)
-    for column in (2, 1):
+    for column in reversed(others):
         np.bitwise_and(key, (1 << widths[column]) - 1, out=found[:, column], casting="unsafe")
         key >>= widths[column]
     found[:, 0] = key
