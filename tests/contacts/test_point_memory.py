@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-import trimesh
 import warp as wp
 from helpers import refused
-from helpers.bodies import FLOOR, about, box, model_of
+from helpers.bodies import FLOOR, about, box
 from helpers.samples import sample
 from helpers.scenes import scene_with
 from oracles.motion import posed
@@ -107,14 +106,11 @@ def test_slow_motions_add_up(device):
         points = query.run().points
         rested.append(bool(is_resting(query)[0]))
         if not rested[-1]:
-            same_points(points, fresh.run().points)
+            others = fresh.run().points
+            assert points.keys() == {*others.keys(), "before"}
+            for name, values in others.items():
+                assert np.ascontiguousarray(values).tobytes() == np.ascontiguousarray(points[name]).tobytes()
     assert rested == [k % 5 != 0 for k in range(18)]
-
-
-def same_points(points, others):
-    assert points.keys() == {*others.keys(), "before"}
-    for name, values in others.items():
-        assert np.ascontiguousarray(values).tobytes() == np.ascontiguousarray(points[name]).tobytes()
 
 
 def test_points_know_their_place_in_the_launch_before(device):
@@ -238,9 +234,7 @@ def test_what_touches_without_a_gap_keeps_its_points(device):
 
 def test_solids_keep_whether_they_hold_one_another(device):
     """A ball inside a solid: no face crosses, and the pair that rests still says so, with the points that it had."""
-    scene = ab.Scene(device)
-    scene.add(model_of(trimesh.creation.box((4, 4, 4))), solid=True)
-    scene.add(sample("small ball"), at(1.2, 0, 0))
+    scene = scene_with(device, (box(4, 4, 4), {"solid": True}), (sample("small ball"), at(1.2, 0, 0)))
     query = ab.ManifoldQuery(scene, [(0, 1)], gap=GAP, remember=REST)
     first, again = query.run(), query.run()
     assert first.any[0] and again.any[0] and is_resting(query)[0]

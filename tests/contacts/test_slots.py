@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from helpers.bodies import about, model_of
+from helpers.bodies import about, box, model_of
 from helpers.samples import sample
 from helpers.scenes import scene_with
 from oracles.triangle import quaternion_matrix
@@ -15,10 +15,6 @@ from warp_abtree.query.stages.slots import SlotStage
 
 GAP = 0.12
 BINS, KINDS, ROOM, A_BIN = int(NORMAL_BINS), int(SCORES), int(SLOT_ROOM), int(SLOTS_A_BIN)
-
-
-def slots_of(query):
-    return next(stage for stage in query.stages if isinstance(stage, SlotStage)).slots
 
 
 def decode(key, width):
@@ -38,26 +34,31 @@ def scores_of(points, depth, across, weight):
     return np.stack([depth, *(depth + part for part in parts)])
 
 
-def bodies(name):
-    if name == "cube on a ball":
-        return trimesh.creation.box((1, 1, 1)).subdivide().subdivide(), trimesh.creation.icosphere(subdivisions=3)
-    return trimesh.creation.torus(1.0, 0.4), trimesh.creation.torus(0.9, 0.3)
+BODIES = {
+    "cube on a ball": (box(1, 1, 1, splits=2), model_of(trimesh.creation.icosphere(subdivisions=3))),
+    "tori": (model_of(trimesh.creation.torus(1.0, 0.4)), model_of(trimesh.creation.torus(0.9, 0.3))),
+}
+
+
+def ask(device, warps, models, pose):
+    """Return the query of the points of two objects, the second at a pose, its slots, and all near contacts."""
+    scene = scene_with(device, models[0], (models[1], pose))
+    with testing.regime(warps=True if warps else None):
+        query = ab.ManifoldQuery(scene, [(0, 1)], gap=GAP)
+        query.run()
+    (stage,) = [stage for stage in query.stages if isinstance(stage, SlotStage)]
+    return query, stage.slots, scene.intersect([(0, 1)], output="contacts", gap=GAP).contacts
 
 
 @pytest.mark.parametrize("warps", [False, True])
-@pytest.mark.parametrize("name", ["cube on a ball", "tori"])
+@pytest.mark.parametrize("name", BODIES)
 def test_no_near_contact_beats_the_winner_of_its_slot(device, name, warps):
     """Faces apart that look towards one another: their nearest points, in float64, of all listed contacts."""
-    rng, meshes, compared, empty, stands = np.random.default_rng(0), bodies(name), 0, 0, 0
-    models = [model_of(mesh) for mesh in meshes]
+    rng, models, compared, empty, stands = np.random.default_rng(0), BODIES[name], 0, 0, 0
     for _ in range(10):
         way = rng.normal(size=3)
         pose = np.array([*(way / np.linalg.norm(way) * rng.uniform(1.3, 1.6)), *about(rng.normal(size=3), 3.0)])
-        scene = scene_with(device, models[0], (models[1], pose))
-        with testing.regime(warps=True if warps else None):
-            query = ab.ManifoldQuery(scene, [(0, 1)], gap=GAP)
-            query.run()
-        rows = scene.intersect([(0, 1)], output="contacts", gap=GAP).contacts
+        query, slots, rows = ask(device, warps, models, pose)
         product = np.einsum("ij,ij->i", rows["normal_a"], rows["normal_b"])
         ahead = np.stack([np.einsum("ij,ij->i", rows["normal"], rows[f"normal_{c}"]) for c in "ab"]) * [[1], [-1]]
         # Where float32 may tell another case.
@@ -66,7 +67,6 @@ def test_no_near_contact_beats_the_winner_of_its_slot(device, name, warps):
         )
         clear &= (rows["separation"] > 1e-4) & (product < -0.01) & (ahead > 0.017).all(0) & (ahead > 0.99).any(0)
         rows, over_a, over_b = rows[clear], *((ahead > 0.99) & (product > -0.5))[:, clear]
-        slots = slots_of(query)
         key, directions = slots.key.numpy()[:ROOM], slots.directions.numpy().reshape(BINS, 3, 3).astype(float)
         weight, widths = slots.weight.numpy()[0], slots.widths.numpy()[0]
         scale = query.pair_poses.numpy()[0]["scale"]
@@ -97,13 +97,8 @@ def test_winners_are_near_and_have_their_scores(device, warps):
     rng, ball = np.random.default_rng(1), sample("small ball")
     vertices, faces = ball.mesh_at(ball.lod_max)[:2]
     pose = np.array([0.2, 0.3, 2.0, *about(rng.normal(size=3), 2.0)])
-    scene = scene_with(device, ball, (ball, pose))
-    with testing.regime(warps=True if warps else None):
-        query = ab.ManifoldQuery(scene, [(0, 1)], gap=GAP)
-        query.run()
-    rows = scene.intersect([(0, 1)], output="contacts", gap=GAP).contacts
+    query, slots, rows = ask(device, warps, (ball, ball), pose)
     near = {tuple(pair): separation for pair, separation in zip(rows["faces"].tolist(), rows["separation"])}
-    slots = slots_of(query)
     weight, (of_a, of_b) = slots.weight.numpy()[0], slots.widths.numpy()[0]
     scale, seen = query.pair_poses.numpy()[0]["scale"], 0
     corners = (
