@@ -149,21 +149,23 @@ def pairs_of(*names):
 
 
 class InFcl:
-    """The parts of a robot and what stands around it in FCL, and the pairs of them that are tested."""
+    """The links of a robot, of a part each, and what stands around it in FCL: (model, pose) by name."""
 
-    def __init__(self, robot, around=()):
-        self.robot, mounted = robot, set(robot.mounted)
+    def __init__(self, robot, **around):
+        self.robot, names = robot, [robot.link_names[k] for k in robot.model_link]
         self.parts = [fcl_object(*model.mesh_at(model.lod_max)[:2]) for model in robot.models]
-        others = [fcl_object(*model.mesh_at(model.lod_max)[:2], pose) for model, pose in around]
-        self.pairs = [(part, b) for k, part in zip(robot.model_link, self.parts) if k not in mounted for b in others]
-        self.pairs += [(self.parts[i], self.parts[j]) for i, j in robot.pairs]
+        moving = [pair for pair, k in zip(zip(names, self.parts), robot.model_link) if k not in robot.mounted]
+        others = [(name, fcl_object(*model.mesh_at(model.lod_max)[:2], pose)) for name, (model, pose) in around.items()]
+        self.pairs = [((names[i], names[j]), self.parts[i], self.parts[j]) for i, j in robot.pairs]
+        self.pairs += [((a, b), part, other) for a, part in moving for b, other in others]
 
-    def ask(self, poses):
-        """Return whether any pair intersects at poses of links (n, 4, 4), and the least distance."""
+    def distances(self, poses):
+        """Return the distance of each tested pair of names, 0 where it intersects, at poses of links (n, 4, 4)."""
         import fcl
+
+        def distance(a, b):
+            return 0.0 if fcl.collide(a, b) else fcl.distance(a, b, fcl.DistanceRequest(), fcl.DistanceResult())
 
         for part, matrix in zip(self.parts, poses[self.robot.model_link]):
             part.setTransform(fcl.Transform(matrix[:3, :3], matrix[:3, 3]))
-        if any(fcl.collide(a, b) for a, b in self.pairs):
-            return True, 0.0
-        return False, min(fcl.distance(a, b, fcl.DistanceRequest(), fcl.DistanceResult()) for a, b in self.pairs)
+        return {names: distance(a, b) for names, a, b in self.pairs}

@@ -1,18 +1,19 @@
-"""Models that a robot holds, and which links and objects intersect: an arm with a cup in a shelf against FCL."""
+"""What robots hold and are padded by: intersecting pairs and distances against FCL, and edges on known ways."""
 
 import copy
 import pickle
-from itertools import combinations
 
-import fcl
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 from helpers import refused
-from helpers.questions import to_matrix
+from helpers.questions import captured, to_matrix
 from helpers.robots import (
+    AROUND,
     MJCF,
     RING,
+    InFcl,
     asked_pairs,
     described_arm,
     described_chain,
@@ -20,16 +21,20 @@ from helpers.robots import (
     random_configurations,
     write_arm,
 )
-from oracles.peers import fcl_object
+from helpers.scenes import scene_with
 from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
 
 # A cup, open where it stands on its hand, and a shelf of two boards.
 CUP = trimesh.creation.annulus(0.05, 0.07, 0.25)
-BOARDS = [(trimesh.creation.box((0.8, 0.4, 0.02)), (0.3, 0.35, z, 0, 0, 0, 1)) for z in (0.6, 1.0)]
+BOARD = ab.Model.load(trimesh.creation.box((0.8, 0.4, 0.02)))
+SHELF = {f"board {k}": (BOARD, (0.3, 0.35, z, 0, 0, 0, 1)) for k, z in enumerate((0.6, 1.0))}
+SHELF["trimesh 2"] = RING, (0, 0, 0.75, 0, 0, 0, 1)  # a name by default
 TILTED = (0.02, 0.0, 0.2, *Rotation.from_rotvec((0.4, 0.1, 0)).as_quat())
 LINKS, FIXED = ("base", "upper", "fore", "left", "right", "flap"), {"fore", "flange"}
+WALL, CUBE = ab.Model.load(trimesh.creation.box((0.1, 1, 1))), trimesh.creation.box((0.1, 0.1, 0.1))
+X, Y, HERE = (1, 0, 0), (0, 1, 0), (0, 0, 0)
 
 
 @pytest.fixture
@@ -39,41 +44,21 @@ def arm(device):
 
 @pytest.fixture
 def shelf(device):
-    scene = ab.Scene(device)
-    for k, (board, pose) in enumerate(BOARDS):
-        scene.add(ab.Model.load(board), pose, name=f"board {k}")
-    scene.add(RING, (0, 0, 0.75, 0, 0, 0, 1))  # "trimesh 2"
+    scene = scene_with(device, *SHELF.values())
+    for k in range(2):
+        scene.change(k, name=f"board {k}")
     return scene
 
 
-class Posed:
-    """The links of an arm, what it holds and the shelf in FCL, and how far each pair of two names is apart."""
-
-    def __init__(self, description, held=()):
-        self.description, self.held = description, held
-        self.links = {name: part for name, part in zip(LINKS, description.parts)}
-        self.objects = {name: fcl_object(part.mesh.vertices, part.mesh.faces) for name, part in self.links.items()}
-        self.objects |= {name: fcl_object(mesh.vertices, mesh.faces) for name, mesh, _, _ in held}
-        self.around = {f"board {k}": fcl_object(b.vertices, b.faces, pose) for k, (b, pose) in enumerate(BOARDS)}
-        ring = RING.mesh_at(RING.lod_max)[:2]
-        self.around |= {"trimesh 2": fcl_object(*ring, (0, 0, 0.75, 0, 0, 0, 1))}
-
-    def distances(self, row, tested):
-        """Return the distance of each pair, 0 where it intersects, by its names, for pairs of links that are tested."""
-        frames = pose_frames(self.description, row)
-        placed = {name: frames[part.link] for name, part in self.links.items()}
-        for name, _, link, pose in self.held:
-            turn = Rotation.from_quat(pose[3:]).as_matrix()
-            placed[name] = frames[self.description.links[link]] @ to_matrix(turn, pose[:3])
-        for name, matrix in placed.items():
-            self.objects[name].setTransform(fcl.Transform(matrix[:3, :3], matrix[:3, 3]))
-        asked = [pair for pair in combinations(self.objects, 2) if frozenset(pair) in tested]
-        asked += [(name, other) for name in self.objects if name != "base" for other in self.around]
-        return {pair: self.distance(*pair) for pair in asked}
-
-    def distance(self, *names):
-        a, b = ((self.objects | self.around)[name] for name in names)
-        return 0.0 if fcl.collide(a, b) else fcl.distance(a, b, fcl.DistanceRequest(), fcl.DistanceResult())
+def distances_at(arm, rows, *held):
+    """Return how far each tested pair of names is apart at configurations, by what is held on the flange and where."""
+    in_fcl, found = InFcl(arm, **SHELF), []
+    for row in rows:
+        frames = pose_frames(described_arm(), row)
+        flange = frames[arm.link_names.index("flange")]
+        placed = [flange @ to_matrix(Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]) for pose in held]
+        found.append(in_fcl.distances(np.array([*frames, *placed])))
+    return found
 
 
 def meeting(distances):
@@ -85,11 +70,10 @@ def test_an_arm_holds_a_cup_in_a_shelf(arm, shelf, touches):
     rows = random_configurations(80, seed=1)
     before, alone = arm.check(rows, shelf), asked_pairs(arm)
     arm.attach(ab.Model.load(CUP), "flange", TILTED, name="cup", touches=touches)
-    assert arm.attached == ("cup",) and arm.link_names[-1] == "cup"
+    assert arm.attached == ("cup",) and arm.link_names[-1] == "cup" and arm.mounted == [0]
     tested = alone | {frozenset(("cup", name)) for name in {*LINKS} - FIXED - {*touches}}
     assert asked_pairs(arm) == tested
-    posed = Posed(described_arm(), [("cup", CUP, "flange", TILTED)])
-    expected = [posed.distances(row, tested) for row in rows]
+    expected = distances_at(arm, rows, TILTED)
     found = arm.check(rows, shelf, which=True)
     assert found == [meeting(distances) for distances in expected]
     named = {name for row in found for pair in row for name in pair}
@@ -131,15 +115,14 @@ def test_the_world_goes_by_its_names_of_now(arm, shelf):
 
 def test_an_edge_is_blocked_by_what_is_held(device):
     """A cube slides along x by 1; a rod of 0.5 that it holds ahead meets a wall 0.8 away."""
-    mesh, wall = trimesh.creation.box((0.1, 0.1, 0.1)), ab.Model.load(trimesh.creation.box((0.1, 1, 1)))
-    car = ab.Robot(described_chain(mesh, ("prismatic", (1, 0, 0), (0, 0, 0), 1.0)), device)
-    world, rod = [(wall, (1.35, 0, 0, 0, 0, 0, 1))], ab.Model.load(trimesh.creation.box((0.5, 0.01, 0.01)))
+    car = ab.Robot(described_chain(CUBE, ("prismatic", X, HERE, 1.0)), device)
+    world, rod = [(WALL, (1.35, 0, 0, 0, 0, 0, 1))], ab.Model.load(trimesh.creation.box((0.5, 0.01, 0.01)))
     assert car.check_edges([0.0], [1.0], world)["clear"]
     car.attach(rod, "link 1", (0.25, 0, 0, 0, 0, 0, 1), name="rod")
     row = car.check_edges([0.0], [1.0], world, tolerance=1e-4)
     assert not row["clear"] and 0.8 - 1e-4 <= row["time"] <= 0.8
     assert car.check([[0.7], [0.9]], which=True) == [[], []]
-    assert car.check([[0.7], [0.9]], world, which=True) == [[], [("rod", f"{wall.name} 0")]]
+    assert car.check([[0.7], [0.9]], world, which=True) == [[], [("rod", f"{WALL.name} 0")]]
     scene = ab.Scene(device)
     assert car.add_to(scene, [0.0]).tolist() == [0, 1] and [scene.name(i) for i in (0, 1)] == ["link 1", "rod"]
     assert len(scene.broad_phase()) == 0
@@ -167,10 +150,7 @@ def test_models_are_attached_to_one_another_and_taken_away_in_any_order(arm, she
     # The lid's place in the flange's frame: that of the cup, then its own.
     turn = Rotation.from_quat(TILTED[3:])
     at = (*(turn.apply(on_top[:3]) + TILTED[:3]), *turn.as_quat())
-    posed = Posed(described_arm(), [("other cup", CUP, "flange", TILTED), ("lid", lid, "flange", at)])
-    expected = [posed.distances(row, asked_pairs(arm)) for row in rows]
-    for row, distances in zip(arm.check(rows, shelf, which=True), expected):
-        assert row == [pair for pair in meeting(distances) if pair[0] != "other cup" or pair[1] not in posed.around]
+    assert arm.check(rows, shelf, which=True) == [meeting(found) for found in distances_at(arm, rows, TILTED, at)]
     arm.detach("lid")
     arm.detach("other cup")
     assert asked_pairs(arm) == alone and arm.mounted == [0]
@@ -208,3 +188,98 @@ def test_bad_attachments_change_nothing(arm):
     refused(ValueError, "which means nothing for output 'distance'", arm.check, rows, output="distance", which=True)
     assert arm.attached == ("cup",) and len(arm.models) == 7 and arm.check(rows[:0], which=True) == []
     assert arm.check(rows, output="distance", beyond=0.0)["names"].shape == (5, 2)
+
+
+PADDING = {"base": 0.5, "upper": 0.01, "fore": 0.02, "left": 0.03, "flap": 0.005}
+NAMED = dict(zip(("ring", "roof"), AROUND))
+AT_WALL = [(WALL, (0.71, 0, 0, 0, 0, 0, 1))]  # a cube touches it from x = 0.61 on
+
+
+@pytest.fixture
+def padded_arm(arm):
+    arm.link_padding = dict(PADDING)
+    return arm
+
+
+def test_pairs_within_paddings_are_those_of_fcl(padded_arm, device):
+    arm, rows = padded_arm, random_configurations(150, seed=5)
+    scene = scene_with(device, *[(*placed, {"name": name}) for name, placed in NAMED.items()])
+    in_fcl, truth = InFcl(arm, **NAMED), []
+    for row in rows:
+        apart = in_fcl.distances(pose_frames(arm.description, row))
+        truth.append({pair: far - sum(PADDING.get(name, 0) for name in pair) for pair, far in apart.items()})
+    assert min(abs(slack) for found in truth for slack in found.values() if slack) > 1e-5, "no matter of rounding"
+    expected = [{pair for pair, slack in found.items() if slack <= 0} for found in truth]
+    assert arm.check(rows, scene, which=True) == [sorted(pairs) for pairs in expected]
+    hit = arm.check(rows, scene)
+    np.testing.assert_array_equal(hit, [bool(pairs) for pairs in expected])
+    np.testing.assert_array_equal(arm.check(rows, AROUND), hit)
+    bare = ab.Robot(described_arm(), device, mounted=["base"])
+    assert 0 < bare.check(rows, scene).sum() < hit.sum() < len(rows)
+    far = [found.tobytes() for found in (robot.check(rows, scene, output="distance") for robot in (arm, bare))]
+    assert far[0] == far[1], "distances are those of the links as they are"
+    arm.link_padding = {name: 0 for name in arm.link_names}
+    np.testing.assert_array_equal(arm.check(rows, scene), bare.check(rows, scene))
+
+
+def test_an_operator_has_the_paddings_of_its_time(padded_arm, device):
+    arm, rows = padded_arm, random_configurations(40, seed=6)
+    expected = arm.check(rows, AROUND)
+    query = arm.query(AROUND, room=40)
+    arm.link_padding = {}
+    assert arm.check(rows, AROUND).sum() < expected.sum()
+    query.configurations.assign(wp.array(rows, dtype=wp.float64, device=device))
+    replay = captured(query)
+    replay()
+    query.check()
+    np.testing.assert_array_equal(query.hit.numpy(), expected)
+
+
+@pytest.mark.parametrize(
+    ("padding", "tolerance"), [(0.0, 1e-3), (2.0**-40, 2.0**-20), (0.01, 0.1), (0.06, 2.0**-20), (0.3, 1e-3)]
+)
+def test_times_of_known_ways(device, padding, tolerance):
+    """A cube drives to a wall, past it, and away from it; its padding may be larger than itself."""
+    car = ab.Robot(described_chain(CUBE, ("prismatic", X, HERE, 1.0), ("prismatic", Y, HERE, 1.0)), device)
+    car.link_padding = {"link 2": padding}
+    near = 0.61 - padding  # least x at which it meets the wall
+    starts = np.array([[0, 0], [near - 0.01, -0.4], [near + 0.001, 0], [0, 0]])
+    ends = np.array([[1, 0], [near - 0.01, 0.4], [0, 0], [-1, 0.3]])
+    rows = car.check_edges(starts, ends, AT_WALL, tolerance)
+    assert near - tolerance <= rows["time"][0] <= near and rows["time"].tolist()[1:] == [1, 0, 1]
+    assert rows["clear"].tolist() == [False, True, False, True] and not rows["undecided"].any()
+    alone = [car.check_edges(a, b, AT_WALL, tolerance) for a, b in zip(starts, ends)]
+    assert np.array(alone).tobytes() == rows.tobytes()
+    at = np.array([[near - 1e-9, 0], [near + 1e-9, 0]])
+    assert car.check(at, AT_WALL).tolist() == [False, True]
+
+
+def test_paddings_go_with_links(padded_arm):
+    arm, rows = padded_arm, random_configurations(30, seed=7)
+    expected = arm.check(rows, AROUND)
+    cup = ab.Model.load(trimesh.creation.icosphere(subdivisions=1, radius=0.02))
+    arm.attach(cup, "flange", (0, 0, 0.1, 0, 0, 0, 1), name="cup")
+    thin = arm.check(rows, AROUND)
+    arm.link_padding["cup"] = 0.2
+    assert (arm.check(rows, AROUND) >= thin).all() and arm.check(rows, AROUND).sum() > thin.sum()
+    arm.detach("cup")
+    assert arm.link_padding == PADDING
+    np.testing.assert_array_equal(arm.check(rows, AROUND), expected)
+
+
+@pytest.mark.parametrize(
+    ("padding", "kind", "message"),
+    [
+        ({"hand": 0.1}, ValueError, "link_padding: the robot has no link 'hand'"),
+        ({"fore": -0.1}, ValueError, "link_padding of 'fore': -0.1 is below 0"),
+        ({"fore": np.nan}, ValueError, "link_padding of 'fore': nan is not a finite number"),
+        ({"fore": "a"}, ValueError, "link_padding of 'fore'"),
+        ({"fore": (1, 2)}, ValueError, "link_padding of 'fore'"),
+        (0.1, TypeError, "link_padding: a float is no dict"),
+    ],
+)
+def test_refuses_bad_paddings(arm, padding, kind, message):
+    rows = random_configurations(2)
+    arm.link_padding = padding
+    for call in (arm.check, arm.query, lambda *_: arm.check_edges(rows, rows)):
+        refused(kind, message, call, rows if call == arm.check else None)
