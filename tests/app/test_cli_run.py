@@ -158,21 +158,18 @@ def test_colours_that_run_draws(scene, drawn):
 
 
 @pytest.mark.parametrize(("world", "objects"), [(0, [0, 1]), (2, [3])])
-def test_picture_of_a_world_of_a_scene_file(tmp_path, monkeypatch, capsys, drawn, world, objects):
-    monkeypatch.chdir(tmp_path)
-    write_scene(tmp_path)
+@pytest.mark.usefixtures("scene")
+def test_picture_of_a_world_of_a_scene_file(capsys, drawn, world, objects):
     shown = run(capsys, "picture", "scene.toml", "--world", world, "--json", "--out", "x.png", "--device", "cpu")[0]
     assert json.loads(shown) == {"picture": "x.png", "objects": len(objects), "frame": 0}
     check_panel(*drawn, load_scene("scene.toml", device="cpu").scene, objects)
 
 
 @pytest.fixture
-def picture(tmp_path, monkeypatch, capsys):
+def picture(scene, capsys):
     """Work in a folder with a scene and a mesh; give a function that draws them."""
     pytest.importorskip("pyvista")
-    monkeypatch.chdir(tmp_path)
     trimesh.creation.icosphere(2).export("ball.obj")
-    write_scene(tmp_path)
     return lambda words: run(capsys, "picture", *words.split(), *"--size 250 --device cpu".split())[0]
 
 

@@ -31,6 +31,7 @@ from warp_abtree.jobs import RayPool
 from warp_abtree.jobs import ray_pool as cluster
 
 ROOT = Path(__file__).resolve().parents[2]
+HERE = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
 INTERRUPT, TERMINATE = signal.SIGINT, signal.SIGTERM
 BOTH = (INTERRUPT, TERMINATE)
 # A process takes 2 to 3 s of a core, most of it to import: quick tests start one of each kind.
@@ -91,13 +92,9 @@ def test_a_signal_stops_a_command(files, words, place, before, number, status, l
     for name in re.findall(r"new\.\w+", words):
         Path(name).write_text("old")
     known = set(files.rglob("*"))
+    command = [sys.executable, "-c", HANG.replace("PLACE", place), *words.split(), "--device", "cpu"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(
-        [sys.executable, "-c", HANG.replace("PLACE", place), *words.split(), "--device", "cpu"],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
-        preexec_fn=before,
-        **pipes,
-    ) as process:
+    with subprocess.Popen(command, env={**os.environ, **HERE}, preexec_fn=before, **pipes) as process:
         try:
             assert process.stdout.readline(), process.stderr.read()
             process.send_signal(number)
@@ -113,14 +110,8 @@ def test_a_signal_stops_a_command(files, words, place, before, number, status, l
 
 def run_process(words, code, **variables):
     """Run code with arguments in a process of its own; return its status and what it says."""
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [sys.executable, "-c", code, *words.split()],
-        env={**os.environ, "PYTHONPATH": path, **variables},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    options = {"env": {**os.environ, **HERE, **variables}, "capture_output": True, "text": True, "timeout": 60}
+    done = subprocess.run([sys.executable, "-c", code, *words.split()], **options)
     return done.returncode, done.stdout, done.stderr
 
 

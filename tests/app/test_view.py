@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import refused
+from helpers.scenes import scene_with
 from helpers.viewer import BODIES, make_playback, write_scene
 from oracles.motion import posed
 
-import warp_abtree as ab
 from warp_abtree.app import load_scene
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.pictures import scenes
@@ -342,9 +342,8 @@ def test_rigid_bodies_are_shown_where_they_stand(tmp_path, device):
     heights = [snapshot.poses[1, 1] for snapshot in snapshots]
     assert (np.diff(heights[:8]) < 0).all() and heights[-1] == heights[-2]
     for snapshot in snapshots:
-        scene = ab.Scene(device=device)
-        for i in range(2):
-            scene.add(playback.scene.models[playback.scene.object_model[i]], snapshot.poses[i])
+        models = [playback.scene.models[m] for m in playback.scene.object_model]
+        scene = scene_with(device, *zip(models, snapshot.poses))
         # Bodies stop where they touch, so that the last bit of a pose decides.
         apart = scene.intersect([(0, 1)], output="distance").distance[0]
         assert (apart < 1e-12) == (len(snapshot.result.faces) > 0)

@@ -12,6 +12,7 @@ import numpy as np
 import PIL.Image
 import pytest
 from helpers import refused
+from helpers.scenes import scene_with
 from helpers.viewer import CHROMIUM, FLAGS, make_models, make_playback, run_command, write_scene
 from oracles.motion import posed
 
@@ -59,6 +60,17 @@ def page(server, device):
 def act(page, *action, seconds=0.2):
     page._post(*action)
     page.run(seconds=seconds)
+
+
+def press(page, name):
+    page._run_button(name)
+    page.advance()
+
+
+def choose(page, mode):
+    page._mode.value = mode
+    page._choose()
+    page.advance()
 
 
 # Who may ask. Headers that are sent, where P is the port, and whether a server at loopback, at all addresses, and at
@@ -135,10 +147,9 @@ def test_a_page_stands_until_it_is_told_to_play(page):
 
 def make_scene(device, count=0):
     """Return a playback of two balls that meet and a ring, in a still scene, and of many more balls, if asked."""
-    (ball, ring), scene = make_models(), ab.Scene(device)
-    scene.add(ball, name="<b>ball</b>")
-    scene.add(ball, (1.5, 0, 0, 0, 0, 0, 1), name="Second")
-    scene.add(ring, (9, 0, 0, 0, 0, 0, 1))
+    ball, ring = make_models()
+    second = ball, (1.5, 0, 0, 0, 0, 0, 1), {"name": "Second"}
+    scene = scene_with(device, (ball, {"name": "<b>ball</b>"}), second, (ring, (9, 0, 0, 0, 0, 0, 1)))
     far = np.tile([0, 0, 0, 0, 0, 0, 1.0], (count, 1))
     far[:, 2] = 9 + 3 * np.arange(count)
     scene.add_many([ball] * count, far, names=["far"] * count)
@@ -162,8 +173,7 @@ def test_objects_are_found_selected_and_hidden(server, device):
     objects.select(1)
     page.advance()
     assert "&lt;b&gt;ball&lt;/b&gt; (" in objects._told.content and "<b>" not in objects._told.content
-    page._post(objects.show, [0, 1], False)
-    page.run(seconds=0.2)
+    act(page, objects.show, [0, 1], False)
     assert page.shown.tolist() == page._data.shown.tolist() == [2]
     assert [box.value for box in boxes_of(objects).values()] == [False, False, False, True]
     objects.show([1], True)
@@ -196,9 +206,8 @@ def test_what_does_nothing_is_off(server, device):
     page.advance()
     assert not page._buttons.visible and not page._time.visible and page._budget.disabled and not page._mode.disabled
     assert "paused" not in page._state.content
-    page._mode.value, page._budget.value = "budget, predicted", 7.0
-    page._choose()
-    page.advance()
+    page._budget.value = 7.0
+    choose(page, "budget, predicted")
     assert page._buttons.visible and not page._budget.disabled
     page._act((page._run_button, ("play",)))
     page.advance()
@@ -210,8 +219,7 @@ def test_what_does_nothing_is_off(server, device):
 
 
 def test_a_model_of_one_lod_has_nothing_to_choose(server, device):
-    scene = ab.Scene(device)
-    scene.add(ab.Model.from_arrays(np.eye(3), [(0, 1, 2)]))
+    scene = scene_with(device, ab.Model.from_arrays(np.eye(3), [(0, 1, 2)]))
     page = Page(server, StillPlayback(scene, "face", up=(1, 2, 3)))
     assert page._mode.disabled and page._all_lod.disabled
     # The grid lies across up, below the scene.
@@ -239,8 +247,7 @@ def test_frames_are_looked_at_again(server, device, monkeypatch):
     page = Page(server, make_playback(device))
     page.advance()
     for _ in range(5):
-        page._run_button("step")
-        page.advance()
+        press(page, "step")
     shown, number = page.snapshot, page.playback.number
     assert page._time.visible and (page._time.min, page._time.max, page._time.value) == (0, 4, 4)
     monkeypatch.setattr(page.playback, "query", None)
@@ -249,12 +256,10 @@ def test_frames_are_looked_at_again(server, device, monkeypatch):
     page.advance()
     assert page.snapshot.number == 1 and not len(page._data.distance) and "looking back" in page._state.content
     assert page.snapshot.lods[0] > shown.lods[0] and page.playback.number == number, "LODs fall as they sweep"
-    page._run_button("step")
-    page.advance()
+    press(page, "step")
     assert page.snapshot.number == number + 1
     monkeypatch.setattr(module, "KEPT_BYTES", 1)
-    page._run_button("step")
-    page.advance()
+    press(page, "step")
     assert [kept.number for kept in page._kept] == [number + 1, number + 2]
 
 
@@ -266,9 +271,7 @@ def test_many_faces_are_opened_coarser(server, device, monkeypatch):
     page.advance()
     assert 550 < page._data.faces < 650 and (page.snapshot.lods < first).all()
     assert page._mode.value == "hold as they are"
-    page._mode.value = "as the scene says"
-    page._choose()
-    page.advance()
+    choose(page, "as the scene says")
     assert page._data.faces == 2 * 320 + 576 and np.array_equal(page.snapshot.lods, first)
     playback.choose("predictive", 50.0)
     assert Page(server, playback)._mode.value == "budget, predicted", "a budget chooses LODs itself"

@@ -5,6 +5,7 @@ import PIL.Image
 import pytest
 import trimesh
 from helpers import refused
+from helpers.scenes import scene_with
 from helpers.viewer import BODIES, make_models, make_playback, write_scene
 from oracles.motion import posed
 
@@ -22,12 +23,9 @@ CAMERA = "[camera]\neye = [9, 1, 2]\ntarget = [0, 0, 0]\n"
 
 def make_scene(device):
     """Return a plate, a ball that it cuts a face of, above it along z, and a ball in a world of its own."""
-    scene = ab.Scene(device)
-    plate = ab.Model.load(trimesh.creation.box((4, 4, 0.5)))
-    scene.add(plate, name="plate")
-    scene.add(make_models()[0], (0, 0, 1.2, 0, 0, 0, 1))
-    scene.add(make_models()[0], (9, 0, 0, 0, 0, 0, 1), world=2)
-    return scene
+    plate, ball = ab.Model.load(trimesh.creation.box((4, 4, 0.5))), make_models()[0]
+    placed = (plate, {"name": "plate"}), (ball, (0, 0, 1.2, 0, 0, 0, 1)), (ball, (9, 0, 0, 0, 0, 0, 1), {"world": 2})
+    return scene_with(device, *placed)
 
 
 def rows_of(path, colour) -> np.ndarray:
@@ -88,8 +86,7 @@ def test_what_picture_refuses(device, tmp_path):
     scene.set_lods([0, 0, 0])
     refused(ValueError, "result: has faces that are not there", picture, scene, path, result=found)
     scene.remove([1, 2])
-    other = ab.Scene(device)
-    other.add(make_models()[0])
+    other = scene_with(device, make_models()[0])
     refused(ValueError, "result: names an object", picture, other, path, result=found)
     assert not list(tmp_path.iterdir())
 
