@@ -6,7 +6,9 @@ from itertools import product
 import numpy as np
 import pytest
 import trimesh
+from helpers.questions import to_matrix
 from helpers.samples import random_quaternions
+from helpers.scenes import scene_with
 from oracles.triangle import quaternion_matrix
 from trimesh.transformations import translation_matrix
 
@@ -72,10 +74,8 @@ def test_bounds_by_boxes_are_no_more_than_distances(where, stretch):
         way = np.ones(3) / 3**0.5 if turn % 6 == 3 else np.eye(3)[turn % 3] * (1 if turn % 8 < 4 else -1)
         place_a = world * rng.normal(size=3)
         place_b = rotations[0] @ corners[0] + place_a + apart * way - rotations[1] @ corners[1]
-        shapes, poses = [face_at(rng, corner, size) for corner in corners], []
-        for rotation, position in zip(rotations, (place_a, place_b)):
-            poses.append(np.eye(4))
-            poses[-1][:3, :3], poses[-1][:3, 3] = rotation, position
+        shapes = [face_at(rng, corner, size) for corner in corners]
+        poses = [to_matrix(*pose) for pose in zip(rotations, (place_a, place_b))]
         (gap,) = place(shapes, poses).gaps(np.array([[0, 1]]))
         square = least_square(shapes, poses)
         assert Fraction(gap) ** 2 <= square
@@ -86,10 +86,8 @@ def test_bounds_by_boxes_are_no_more_than_distances(where, stretch):
 def test_the_pair_of_the_nearest_corners_is_looked_at_first(monkeypatch):
     """Whatever the number of pairs at a time, among pairs whose boxes may be nearer than their corners."""
     rng = np.random.default_rng(4)
-    shapes, poses = [face_at(rng, np.zeros(3), 0.3) for _ in range(9)], []
-    for quaternion in random_quaternions(rng, 9):
-        poses.append(np.eye(4))
-        poses[-1][:3, :3], poses[-1][:3, 3] = quaternion_matrix(quaternion), 3 * rng.normal(size=3)
+    shapes = [face_at(rng, np.zeros(3), 0.3) for _ in range(9)]
+    poses = [to_matrix(quaternion_matrix(q), 3 * rng.normal(size=3)) for q in random_quaternions(rng, 9)]
     placed, pairs = place(shapes, poses), np.stack(np.triu_indices(9, 1), 1)
     squares = [least_square([shapes[i] for i in pair], [poses[i] for i in pair]) for pair in pairs]
     for order in (np.argsort(squares), np.argsort(squares)[::-1], rng.permutation(len(pairs))):
@@ -107,10 +105,8 @@ def test_the_least_distance_may_be_that_of_a_frame_off_orthonormal(device):
     manager.add_object("beside it", box, translation_matrix((101, 0, 0)))
     manager.add_object("first", box, translation_matrix((0, 1e4, 0)))
     manager.add_object("second", box, translation_matrix((101 - 50 * STRETCH, 1e4, 0)))
-    scene = ab.Scene(device)
     model = ab.Model.load(box)
-    for pose in (shrunk, translation_matrix((101, 0, 0))):
-        scene.add(model, pose)
+    scene = scene_with(device, (model, shrunk), (model, translation_matrix((101, 0, 0))))
     expected = scene.intersect([(0, 1)], "distance").distance[0]
     assert 100 - 101 * STRETCH < expected < 100 - 60 * STRETCH
     distance, names = manager.min_distance_internal(return_names=True)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from helpers import refused
+from helpers.questions import to_matrix
 from helpers.samples import random_poses, sample
 from helpers.scenes import scene_with
 from oracles.triangle import quaternion_matrix
@@ -29,31 +30,28 @@ def pair_distance(torch):
     return pair_distance
 
 
+def objects():
+    return [(sample(name), {"solid": True, "lod": sample(name).lod_for(fraction=0.3)}) for name in NAMES]
+
+
 def make_query(device, pairs=PAIRS):
     """Return a signed query of four solids, and poses with some in one another and quaternions of any norm."""
     rng = np.random.default_rng(8)
     poses = random_poses(rng, 4, 1.4)
     poses[:, 3:] *= rng.uniform(0.2, 5.0, (4, 1))
-    objects = [(sample(name), {"solid": True, "lod": sample(name).lod_for(fraction=0.3)}) for name in NAMES]
-    return ab.DistanceQuery(scene_with(device, *objects), pairs, signed=True), poses
+    return ab.DistanceQuery(scene_with(device, *objects()), pairs, signed=True), poses
 
 
 def distances_at(query, poses):
     """Return distances at poses whose quaternions are normalised here."""
-    scene = ab.Scene(query.device)
-    for name, pose in zip(NAMES, poses):
-        model = sample(name)
-        unit = np.append(pose[:3], pose[3:] / np.linalg.norm(pose[3:]))
-        scene.add(model, unit, lod=model.lod_for(fraction=0.3), solid=True)
+    units = np.hstack([poses[:, :3], poses[:, 3:] / np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)])
+    scene = scene_with(query.device, *[(model, unit, options) for (model, options), unit in zip(objects(), units)])
     return scene.intersect(query.given, "distance", signed=True).distance
 
 
 def to_matrices(poses):
-    matrices = np.tile(np.eye(4), (len(poses), 1, 1))
-    for matrix, pose in zip(matrices, poses):
-        matrix[:3, :3] = quaternion_matrix(pose[3:] / np.linalg.norm(pose[3:]))
-        matrix[:3, 3] = pose[:3]
-    return matrices
+    parts = ((pose[:3], pose[3:]) for pose in poses)
+    return np.array([to_matrix(quaternion_matrix(q / np.linalg.norm(q)), place) for place, q in parts])
 
 
 def test_gradcheck_and_values(device, torch, pair_distance):
@@ -138,13 +136,11 @@ def slopes_of_loss(device):
     """Return differences of the sum of squared distances by each number of the poses, (4, 7)."""
     query, poses = make_query(device)
     slopes = np.zeros((4, 7))
-    for i, j in np.ndindex(4, 7):
-        ends = []
-        for step in (1e-6, -1e-6):
-            moved = poses.copy()
-            moved[i, j] += step
-            ends.append((distances_at(query, moved) ** 2).sum())
-        slopes[i, j] = (ends[0] - ends[1]) / 2e-6
+    for at in np.ndindex(4, 7):
+        step = np.zeros((4, 7))
+        step[at] = 1e-6
+        before, after = ((distances_at(query, poses + sign * step) ** 2).sum() for sign in (-1, 1))
+        slopes[at] = (after - before) / 2e-6
     return slopes
 
 

@@ -43,8 +43,9 @@ def assembly(with_extras=False):
     return source
 
 
-def assert_matches(scene, names, meshes, tolerance=1e-12):
-    assert sorted(names) == sorted(meshes) and scene.object_count == len(names)
+def assert_matches(scene, meshes, tolerance=1e-12):
+    names = names_of(scene)
+    assert sorted(names) == sorted(meshes)
     for i, name in enumerate(names):
         assert np.allclose(posed_triangles(scene, i), meshes[name].triangles, atol=tolerance), name
 
@@ -293,9 +294,9 @@ def red_faces(mesh):
 
 
 def test_coloured_result_out(device, tmp_path):
-    scene, ring = ab.Scene(device), ab.Model.load(trimesh.creation.torus(0.6, 0.2, 16, 8))
-    for k in range(6):
-        scene.add(ring, (0.5 * k + (k > 2) * 9, 0, 0, 0, 0, 0, 1), lod=ring.lod_for(fraction=0.5) if k else None)
+    ring = ab.Model.load(trimesh.creation.torus(0.6, 0.2, 16, 8))
+    scene = scene_with(device, *[(ring, (0.5 * k + (k > 2) * 9, 0, 0, 0, 0, 0, 1)) for k in range(6)])
+    scene.set_lods([ring.lod_max] + 5 * [ring.lod_for(fraction=0.5)])
     result = scene.intersect(output="faces")
     assert len(result.faces)
     intersecting = np.unique(result.pairs[result.any])
@@ -317,25 +318,22 @@ def test_coloured_result_out(device, tmp_path):
 def test_plain_scene_in_and_out_and_in(tmp_path):
     source = assembly()
     scene = ab.scene_from_trimesh(assembly(with_extras=True), device="cpu")
-    names = names_of(scene)
-    assert_matches(scene, names, nodes_in_the_world(source))
+    assert_matches(scene, nodes_in_the_world(source))
     # Rigid, doubled, mirrored, flattened: four of each geometry.
-    assert len(scene.models) == 8 and len(names) == 12
+    assert len(scene.models) == 8 and scene.object_count == 12
     for i, model in enumerate(scene.models):
         vertices, faces, _ = model.mesh_at(model.lod_max)
         assert trimesh.Trimesh(vertices, faces).volume > 0, f"model {i} is inside out"
     out = ab.to_trimesh(scene)
     assert len(out.geometry) == 8, "instances share a geometry"
-    again = ab.scene_from_trimesh(out, device="cpu")
-    back = names_of(again)
-    assert back == names and len(again.models) == 8
-    assert_matches(again, back, nodes_in_the_world(source))
+    again, names = ab.scene_from_trimesh(out, device="cpu"), names_of(scene)
+    assert names_of(again) == names and len(again.models) == 8
+    assert_matches(again, nodes_in_the_world(source))
     # glTF holds float32, and keeps instances.
     source.export(tmp_path / "scene.glb")
     again = ab.scene_from_file(tmp_path / "scene.glb", device="cpu")
-    back = names_of(again)
     assert len(again.models) == 8
-    assert_matches(again, back, nodes_in_the_world(source), 1e-5)
+    assert_matches(again, nodes_in_the_world(source), 1e-5)
     for bad in (names[:-1], [names[0]] * 12, list(range(12))):
         refused(ValueError, "names: not 12 different strings", ab.to_trimesh, scene, names=bad)
     small = scene_with("cpu", scene.models[0])
