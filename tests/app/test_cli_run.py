@@ -126,15 +126,16 @@ def drawn(monkeypatch):
 
 
 def check_panel(panel, scene, objects):
-    """Compare the colours of a panel with the faces of objects, and with those that intersect one another, twice."""
+    """Compare the colours of a panel, and its count, with the faces of objects and those that meet, which are twice."""
     meshes = {i: scene.models[scene.object_model[i]].mesh_at(scene.lods[i])[:2] for i in objects}
     middles = {i: posed(at, scene.poses[i])[faces].mean(axis=1) for i, (at, faces) in meshes.items()}
-    colours, total = {i: COLOURS[scene.object_model[i]] for i in objects}, 0
+    colours, total, pairs = {i: COLOURS[scene.object_model[i]] for i in objects}, 0, 0
     expected = {(i, colours[i][0], 1): middles[i] for i in objects}
     if len(objects) == 2:
         i, j = objects
         hits = brute_force_faces(*meshes[i], *meshes[j], scene.poses[i], scene.poses[j]).T
-        assert hits.shape[1] > 100
+        pairs = hits.shape[1]
+        assert pairs > 100
         # A little above each face and below it.
         expected |= {(k, colours[k][1], 2): middles[k][np.unique(rows)] for k, rows in zip(objects, hits)}
     for (_, colour, times), points in expected.items():
@@ -142,7 +143,7 @@ def check_panel(panel, scene, objects):
         apart, off = np.linalg.norm(own[:, None] - points[None], axis=2), 1e-9 if times == 1 else 0.01
         assert len(own) == times * len(points) and max(apart.min(axis=0).max(), apart.min(axis=1).max()) < off
         total += len(own)
-    assert total == len(panel.triangles)
+    assert total == len(panel.triangles) and panel.title.endswith(f"\n{pairs:,} intersecting face pairs")
 
 
 def test_colours_that_run_draws(scene, drawn):
@@ -157,12 +158,15 @@ def test_colours_that_run_draws(scene, drawn):
     check_panel(drawn[1], loaded.scene, [0, 1])
 
 
-@pytest.mark.parametrize(("world", "objects"), [(0, [0, 1]), (2, [3])])
+@pytest.mark.parametrize(
+    ("world", "objects", "title"), [(0, [0, 1], "2 objects, 2,368 faces\n"), (2, [3], "1 object, 2,048 faces\n")]
+)
 @pytest.mark.usefixtures("scene")
-def test_picture_of_a_world_of_a_scene_file(capsys, drawn, world, objects):
+def test_picture_of_a_world_of_a_scene_file(capsys, drawn, world, objects, title):
     shown = run(capsys, "picture", "scene.toml", "--world", world, "--json", "--out", "x.png", "--device", "cpu")[0]
     assert json.loads(shown) == {"picture": "x.png", "objects": len(objects), "frame": 0}
     check_panel(*drawn, load_scene("scene.toml", device="cpu").scene, objects)
+    assert drawn[0].title.startswith(title)
 
 
 @pytest.fixture

@@ -32,17 +32,6 @@ from atomic_write import atomic_write
 """
 
 
-def start(script, *arguments):
-    command = [sys.executable, "-c", IMPORT + script, *map(str, arguments)]
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-
-def end(processes):
-    for process in processes:
-        process.kill()
-        process.communicate()
-
-
 @pytest.fixture
 def calls(monkeypatch):
     """Give the list into which calls of os.fsync and os.replace go: what is synced, and its size then."""
@@ -173,7 +162,9 @@ with atomic_write(sys.argv[1]) as file:
 
 
 def test_sweeping_up_leaves_what_another_process_is_writing(tmp_path):
-    live, dead = (start(HALF, tmp_path / name) for name in ("live", "dead"))
+    commands = [[sys.executable, "-c", IMPORT + HALF, tmp_path / name] for name in ("live", "dead")]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    live, dead = (subprocess.Popen(command, **pipes) for command in commands)
     try:
         assert live.stdout.readline() == dead.stdout.readline() == "half\n"
         (tmp_path / f"dead.{live.pid}-0123abcd{SUFFIX}").touch()  # of a writer that had the same id once
@@ -193,7 +184,9 @@ def test_sweeping_up_leaves_what_another_process_is_writing(tmp_path):
         live.communicate("\n")
         assert live.returncode == 0
     finally:
-        end((live, dead))
+        for process in (live, dead):
+            process.kill()
+            process.communicate()
     assert (tmp_path / "live").read_text() == "half and half" and not list(tmp_path.glob("live.*"))
 
 

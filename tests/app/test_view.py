@@ -65,25 +65,6 @@ def test_colours_and_legend_tell_models_or_lods(playback):
     assert by_lod == ["coarsest LOD", "finest LOD", plain[1], plain[3]]
 
 
-def test_a_panel_holds_what_the_title_counts(playback):
-    cache, snapshot = geometry.MeshCache(playback.scene), playback.query("faces")
-    settings = Settings()
-    data = compose(cache, snapshot, np.arange(3), settings)
-    panel = scenes.make_panel(cache, data)
-    # Plain faces come first, then both sides of each intersecting one.
-    faces, hits = 2 * 320 + 576, snapshot.result.faces
-    met = {(int(snapshot.result.pairs[row[0], side]), row[1 + side]) for row in hits.tolist() for side in (0, 1)}
-    assert len(panel.triangles) == len(panel.colours) == faces + 2 * len(met)
-    first = playback.scene.models[0].mesh_at(int(snapshot.lods[0]))
-    assert np.allclose(panel.triangles[:320], first[0][first[1]] + snapshot.poses[0, :3])
-    bright = np.array([COLOURS[0][1], COLOURS[1][1]])
-    marked = (panel.colours[:, None] == bright).all(axis=2).any(axis=1)
-    assert marked.sum() == 2 * len(met) and not marked[:faces].any()
-    assert panel.title == f"3 objects, 1,216 faces\n{len(hits):,} intersecting face pairs"
-    alone = scenes.make_panel(cache, compose(cache, snapshot, np.array([0]), Settings()))
-    assert len(alone.triangles) == 320 and alone.title == "1 object, 320 faces\n0 intersecting face pairs"
-
-
 def test_the_camera_sees_all_points():
     eye = (0.4, 0.35, 1.0)
     points = np.random.default_rng(3).normal(size=(500, 3)) * [5, 1, 0.2] + [10, 0, 0]

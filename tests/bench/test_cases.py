@@ -217,11 +217,8 @@ class FewLaunches(compare.Tree):
         return found | {"times": LAUNCHES} if do == "list" else found
 
 
-def kept_kernels():
-    """Return a context of this machine's kernel cache, for the empty one that a first answer is timed with."""
-    return contextlib.nullcontext(str(Path(wp.config.kernel_cache_dir).parent))
-
-
+# This machine's kernel cache, for the empty one that a first answer is timed with.
+KEPT_KERNELS = contextlib.nullcontext(str(Path(wp.config.kernel_cache_dir).parent))
 # What cases do at smaller sizes still: modules, names in them, and what stands there.
 SMALLER = {
     "assembly": {(newton_nuts, "OURS"): {name: newton_nuts.OURS[name] for name in ("ours", "ours_30um")}},
@@ -232,7 +229,7 @@ SMALLER = {
         (budget, "STAGED"): ("focus", "rain"),
         (budget, "collect"): lambda: None,
     },
-    "gate": {(compare, "Tree"): FewLaunches, (compare.tempfile, "TemporaryDirectory"): kept_kernels},
+    "gate": {(compare, "Tree"): FewLaunches, (compare.tempfile, "TemporaryDirectory"): lambda: KEPT_KERNELS},
     "points": {
         (points, "LODS"): {name: points.LODS[name] for name in ("all faces", "30 um")},
         (points, "penetration_allowed"): partial(points.penetration_allowed, count=200),
