@@ -60,7 +60,7 @@ NO_NUMBER, NO_FLAG = (False, True, "x", np.nan), (0, 1, "x", [True])
 BAD_NUMBERS = ("8", None, np.nan, -1.0, [8.0])
 REFUSED = [
     *refuse("time_step", lambda x: ab.Frame(balls(), time_step=x), 0, np.nan, "x"),
-    *refuse("output", lambda x: ab.Frame(balls(), output=x), "everything", None),
+    *refuse("^output ", lambda x: ab.Frame(balls(), output=x), "everything", None, np.zeros(0)),
     *refuse("lods", lambda x: ab.Frame(balls(), lods=x), "paper", [0, 0]),
     *refuse("clock", lambda x: ab.Frame(balls(), clock=x), 3.0, "cpu"),
     *refuse("motion", lambda x: ab.Frame(balls(), motion=x), ab.Kinematic(np.zeros((99, 3)))),
@@ -94,12 +94,20 @@ REFUSED = [
     *refuse("^solid .*'closed'", lambda x: ab.scene_from_trimesh(trimesh.Scene(), solid=x), *NO_FLAG, None),
     *refuse("^device ", lambda x: ab.Query(balls(), "any").run(x), *NO_FLAG),
     *refuse("^device ", lambda x: ab.Query(balls(), "any").result(x), *NO_FLAG),
-    *refuse("^output ", lambda x: ab.Frame(balls(), output=x), np.zeros(0)),
     *refuse("^dt\\b", lambda x: ab.Dynamics(balls()).launch(x), 0, -1, np.nan, np.inf, "x", None),
     *refuse("^velocity: ", lambda x: ab.Dynamics(balls(), velocity=x), "x", object(), 10**400),
-    *refuse("^kinematic: ", lambda x: ab.Dynamics(balls(), kinematic=x), [[0], [0, 1]]),
-    *refuse("^position: ", lambda x: ab.Kinematic(x), "x", object(), 10**400),
-    *refuse("friction", lambda x: ab.Dynamics(balls(count=1), friction=x), np.inf),
+    *refuse("^velocity: a number is not finite", lambda x: ab.Dynamics(balls(), velocity=x), (np.nan, 0, 0)),
+    *refuse("^angular_velocity: shape", lambda x: ab.Dynamics(balls(), angular_velocity=x), (1, 2)),
+    *refuse("^gravity", lambda x: ab.Dynamics(balls(), gravity=x), (0, 0, np.inf)),
+    *refuse("^kinematic", lambda x: ab.Dynamics(balls(), kinematic=x), [[0], [0, 1]], [5], [True]),
+    *refuse("^friction", lambda x: ab.Dynamics(balls(), friction=x), np.inf),
+    *refuse("^friction -0.1 is below 0", lambda x: ab.Dynamics(balls(), friction=x), -0.1),
+    *refuse("^capacity", lambda x: ab.Dynamics(balls(), capacity=x), 0),
+    *refuse("^position: ", lambda x: ab.Kinematic(x), "x", object(), 10**400, [0.0, 0, 0]),
+    *refuse("^velocity", lambda x: ab.Kinematic(np.zeros((3, 3)), velocity=x), np.zeros((2, 3)), [np.nan, 0, 0]),
+    *refuse("^rotation", lambda x: ab.Kinematic(np.zeros((3, 3)), rotation=x), [0.0, 0, 0, 2]),
+    *refuse("^axis", lambda x: ab.Kinematic(np.zeros((3, 3)), axis=x, rate=1.0), [0.0, 0, 0]),
+    *refuse("^period", lambda x: ab.Kinematic(np.zeros((3, 3)), period=x), 0.0, np.nan),
     *refuse(
         "base_faces", lambda x: ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], base_faces=x), 0, 1.5, np.inf, "ten", True
     ),

@@ -274,20 +274,6 @@ def test_shuttle_reflects_at_its_ends(time, way):
     assert np.allclose(motion.poses(time)[0, :3], [0.5 + way, -2.0 * way, 1.0 + 0.5 * way])
 
 
-WRONG = (
-    {"position": [0.0, 0, 0]},
-    {"velocity": np.zeros((2, 3))},
-    {"velocity": [np.nan, 0, 0]},
-    {"rotation": [0.0, 0, 0, 2]},
-)
-WRONG += {"axis": [0.0, 0, 0], "rate": 1.0}, {"period": 0.0}, {"period": np.nan}
-
-
-@pytest.mark.parametrize("wrong", WRONG, ids=str)
-def test_motion_refuses(wrong):
-    refused(ValueError, next(iter(wrong)), ab.Kinematic, **{"position": np.zeros((3, 3)), **wrong})
-
-
 def test_quaternions_of_all_rotations():
     q = np.random.default_rng(0).normal(size=(200, 4))
     q = np.concatenate([q, np.eye(4), [[1, 1, 0, 0], [0, 1, 1, 1e-12], [1e-9, 1, 0, 1]]])

@@ -69,22 +69,6 @@ def test_capacity_grows_in_steps_and_is_refused_in_launches(device):
             short.check()
 
 
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"friction": -0.1}, "friction -0.1 is below 0"),
-        ({"gravity": (0, 0, np.inf)}, "gravity"),
-        ({"kinematic": [5]}, "kinematic"),
-        ({"kinematic": [True]}, "kinematic"),
-        ({"velocity": (np.nan, 0, 0)}, "velocity: a number is not finite"),
-        ({"angular_velocity": (1, 2)}, "angular_velocity: shape"),
-        ({"capacity": 0}, "capacity"),
-    ],
-)
-def test_bad_numbers_are_refused(options, message):
-    refused(ValueError, message, on_ground, "cpu", (CUBE, (0, 0, 2, 0, 0, 0, 1)), **options)
-
-
 def test_bad_use_is_refused():
     dynamics = on_ground("cpu", (CUBE, (0, 0, 2, 0, 0, 0, 1)))
     before = bits(dynamics)
