@@ -4,6 +4,7 @@ import ast
 import re
 import sys
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -137,21 +138,11 @@ def import_edges(path, tree=None):
 
 def find_cycle(edges):
     """Return modules that import one another in a circle, [] where there is none."""
-    done, trail = set(), []
-
-    def walk(module):
-        if module in trail:
-            return trail[trail.index(module) :]
-        if module in done or module not in edges:
-            return []
-        trail.append(module)
-        for other in sorted(edges[module] & edges.keys()):
-            if other != module and (found := walk(other)):
-                return found
-        done.add(trail.pop())
-        return []
-
-    return next((found for module in sorted(edges) if (found := walk(module))), [])
+    try:
+        TopologicalSorter({module: found - {module} for module, found in edges.items()}).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return []
 
 
 def documented():

@@ -8,6 +8,8 @@ import trimesh
 import warp as wp
 from helpers import refused
 from helpers.bodies import PairContacts, at, collided, contact_rows, newton_mesh, settle, touching_shapes
+from helpers.samples import STILL
+from oracles.motion import posed
 
 import warp_abtree as ab
 from warp_abtree.interop import newton as adapter
@@ -26,20 +28,14 @@ def pair_contacts(request, monkeypatch):
         monkeypatch.setattr(newton, "CollisionPipeline", PairContacts)
 
 
-def matrix(pose):
-    found = trimesh.transformations.quaternion_matrix([pose[6], *pose[3:6]])
-    found[:3, 3] = pose[:3]
-    return found
-
-
 def world_points(model, state, contacts):
     """Surface points of both shapes in the world, by Newton's convention for points and offsets of bodies."""
     body, body_q = model.shape_body.numpy(), state.body_q.numpy()
     points = []
     for side in (0, 1):
         shapes, point, offset = contact_rows(contacts, *(f"{name}{side}" for name in ("shape", "point", "offset")))
-        poses = [np.eye(4) if body[s] < 0 else matrix(body_q[body[s]]) for s in shapes]
-        points.append(np.array([(m @ [*x, 1])[:3] for m, x in zip(poses, point + offset)]).reshape(-1, 3))
+        poses = [STILL if body[s] < 0 else body_q[body[s]] for s in shapes]
+        points.append(np.array([posed(x, pose) for pose, x in zip(poses, point + offset)]).reshape(-1, 3))
     return points, *contact_rows(contacts, "normal")
 
 
@@ -60,8 +56,8 @@ def test_a_cube_on_a_floor_has_its_corners(device):
         assert set(getattr(contacts, f"rigid_contact_shape{side}").numpy()[:4]) == {side}
     # The floor's margin thickens it, as in Newton.
     np.testing.assert_allclose((second - first) @ [0, 0, 1], -0.03, atol=1e-6)
-    r = matrix([0, 0, 0, *at(angle=0.5)[3:]])[:3, :3]
-    corners = np.array([r @ [x, y, 0] + [0.3, 0.2, 0] for x in (-0.5, 0.5) for y in (-0.4, 0.4)])
+    flat = np.array([(x, y, 0) for x in (-0.5, 0.5) for y in (-0.4, 0.4)])
+    corners = posed(flat, np.array(at(0.3, 0.2, angle=0.5)))
     for corner in corners:
         assert np.abs(0.5 * (first + second) - corner)[:, :2].max(1).min() < 1e-6
     assert (contacts.rigid_contact_count.numpy() == 4).all()
