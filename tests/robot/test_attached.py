@@ -82,6 +82,9 @@ def test_an_arm_holds_a_cup_in_a_shelf(arm, shelf, touches):
     assert hit.tolist() == [bool(row) for row in found] and before.sum() < hit.sum() < 80
     near = arm.check(rows, shelf, output="distance")
     np.testing.assert_allclose(near["distance"], [min(distances.values()) for distances in expected], atol=1e-6)
+    np.testing.assert_array_equal(near["distance"] == 0, hit)
+    between = np.linalg.norm(near["points"][:, 0] - near["points"][:, 1], axis=1)
+    np.testing.assert_allclose(between, near["distance"], atol=1e-12)
     assert "cup" in near["names"][~hit, 0]
     for row, names, distances in zip(near[~hit], near["names"][~hit], np.array(expected)[~hit]):
         far = distances.get(tuple(names), distances.get(tuple(names[::-1])))

@@ -15,8 +15,6 @@ from helpers.robots import (
     AROUND,
     RING,
     ROOF,
-    InFcl,
-    asked_pairs,
     described_arm,
     described_chain,
     pose_frames,
@@ -43,32 +41,6 @@ def test_forward_kinematics_is_a_product_of_matrices(arm):
     large = np.array([[1e6, 0, 0, 0], [-1048575.3, 0, 0, 0]])
     turned = np.array([pose_frames(arm.description, row) for row in large])
     np.testing.assert_allclose(arm.forward(large, limits=False).numpy(), turned, atol=1e-13)
-
-
-def test_pairs_leave_neighbours_and_excluded_links_out(device):
-    description = described_arm()
-    # A mesh of the flange too, which is rigidly fixed to the forearm.
-    description.parts.append(replace(description.parts[2], link=3))
-    arm = ab.Robot(description, device)
-    pairs = asked_pairs(arm)
-    around = [(link, other) for link in ("fore", "flange") for other in ("upper", "left", "right", "flap")]
-    left_out = {*map(frozenset, around), *map(frozenset, [("base", "upper"), ("fore", "flange"), ("base", "fore")])}
-    assert not pairs & left_out and len(pairs) == len(arm.pairs) == 21 - len(left_out)
-
-
-def test_answers_are_those_of_fcl(arm):
-    rows = random_configurations(300, seed=1)
-    in_fcl = InFcl(arm, ring=AROUND[0], roof=AROUND[1])
-    far = np.array([min(in_fcl.distances(pose_frames(arm.description, row)).values()) for row in rows])
-    hit = far == 0
-    assert 60 < hit.sum() < 240
-    np.testing.assert_array_equal(arm.check(rows, AROUND), hit)
-    found = arm.check(rows, AROUND, output="distance")
-    np.testing.assert_array_equal(found["distance"] == 0, hit)
-    np.testing.assert_allclose(found["distance"], far, atol=1e-6)
-    assert len({tuple(pair) for pair in found["pair"].tolist()}) > 5
-    between = np.linalg.norm(found["points"][:, 0] - found["points"][:, 1], axis=1)
-    np.testing.assert_allclose(between, found["distance"], atol=1e-12)
 
 
 def test_beyond_ends_the_search(arm):
