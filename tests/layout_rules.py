@@ -292,10 +292,6 @@ def title_faults(source):
     return [f"line 1: {title}"] if not title or RIDDLES.match(title) else []
 
 
-def is_bound(node):
-    return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
-
-
 def top_level_names(tree):
     """Return the names that a module defines at its top level, but for private ones."""
     names = set()
@@ -304,7 +300,8 @@ def top_level_names(tree):
             names.add(node.name)
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            names |= {part.id for target in targets for part in ast.walk(target) if is_bound(part)}
+            parts = [part for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)]
+            names |= {part.id for part in parts if isinstance(part.ctx, ast.Store)}
     return {name for name in names if not name.startswith("_")}
 
 

@@ -276,8 +276,7 @@ def test_a_file_of_parts_is_said_to_be_joined(assemblies, capsys, monkeypatch):
 def test_a_file_of_parts_is_a_scene(assemblies, capsys, device):
     for name, parts in assemblies.items():
         Path("scene.toml").write_text(f'[models.m]\nmesh = "{name}"\n[[objects]]\nmodel = "m"\n')
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as caught:
             ab_app.load_scene("scene.toml", device=device)
         told = [str(each.message) for each in caught if "joined" in str(each.message)]
         start = f"scene.toml: models.m: the {parts} parts of {name} are joined into one mesh; scene_from_file"

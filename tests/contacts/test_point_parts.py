@@ -123,23 +123,16 @@ def test_more_pairs_than_before_are_more_parts(device, monkeypatch):
     assert bytes_of(found) == bytes_of(ab.ManifoldQuery(scene, gap=GAP).run())
 
 
-def test_objects_that_were_removed_are_in_no_part(device, monkeypatch):
-    """Whichever these are, the first two too."""
-    scene, _poses = grid(device)
-    scene.remove([0, 1])
-    whole = bytes_of(ab.ManifoldQuery(scene, gap=GAP).run())
-    shorten_lists(monkeypatch)
-    query = ab.ManifoldQuery(scene, None, ab.Buffers(100, None, 100), gap=GAP)
-    assert bytes_of(query.run()) == whole and query.parts is not None
-
-
+# Objects that were removed, as the first two, are in no part. Where hits are too many for one list, what waits has room
+# in its list, but perhaps not in that of a part.
 @pytest.mark.usefixtures("regime")
-def test_a_list_of_parts_may_be_shorter_than_that_of_the_query(device, monkeypatch):
-    """Where hits are too many for one list, what waits has room in its list, but perhaps not in that of a part."""
+@pytest.mark.parametrize(("removed", "at_once", "room"), [([0, 1], (300, 2000), 100), ([], (60, 500), 2**17)])
+def test_parts_of_what_is_left_and_lists_that_are_shorter_than_the_querys(device, monkeypatch, removed, at_once, room):
     scene, _poses = grid(device)
+    scene.remove(removed)
     whole = bytes_of(ab.ManifoldQuery(scene, gap=GAP).run())
-    shorten_lists(monkeypatch, 60, 500)
-    query = ab.ManifoldQuery(scene, None, ab.Buffers(100, None, 2**17), gap=GAP)
+    shorten_lists(monkeypatch, *at_once)
+    query = ab.ManifoldQuery(scene, None, ab.Buffers(100, None, room), gap=GAP)
     assert bytes_of(query.run()) == whole and query.parts is not None
 
 

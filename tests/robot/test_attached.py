@@ -1,4 +1,4 @@
-"""What robots hold and are padded by: intersecting pairs and distances against FCL, and edges on known ways."""
+"""Held models and padded links: intersecting pairs and distances against FCL, and edges on known ways."""
 
 import copy
 import pickle

@@ -123,8 +123,7 @@ def test_equalities_and_tendons_that_nothing_enforces_are_named(tmp_path):
     with pytest.warns(RuntimeWarning, match="disables contacts; Robot.check tests its pairs all the same$") as caught:
         robot = load(arm(rest, '<option><flag constraint="disable"/></option>'), tmp_path)
     assert len(caught) == 1 and len(robot.pairs) == len(load(arm(), tmp_path).pairs)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         load(arm(tendons, '<option><flag limit="disable"/></option>'), tmp_path)
         # Nothing is enforced there, and joints follow none.
         for disabled in (equalities.split("<tendon")[0], '<joint joint1="t" joint2="q"/>'):

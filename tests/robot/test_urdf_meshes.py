@@ -115,8 +115,7 @@ def test_what_joints_do_not_place_is_named(tmp_path):
     assert len(caught) == 1
     with pytest.warns(RuntimeWarning, match="r.urdf: 'm', 'n' hang on no joint, and are placed where 'l' is"):
         load(tmp_path, "part.stl", rest='<link name="m"/><link name="n"/>')
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         refused(RuntimeWarning, "not enforced", load, tmp_path, "part.stl", rest=loops)
         others = '<gazebo reference="l"/><transmission name="t"><joint name="x"/></transmission>'
         load(tmp_path, "part.stl", rest=others)
@@ -188,8 +187,7 @@ def test_links_that_the_robot_lacks_are_refused_or_named(load_pairs):
     with pytest.warns(RuntimeWarning, match=r"r.srdf: what is said of 'camera', 'mast' is left out") as caught:
         assert load_pairs(entries, strict=False) == ALL - JOINED - pairs_of("l0 l2")
     assert len(caught) == 1 and caught[0].filename == __file__
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         load_pairs(write([("disable_collisions", "l0", "l2")]), strict=False)
 
 
@@ -198,8 +196,7 @@ def test_unknown_elements_are_named(load_pairs):
         assert load_pairs('<disable_collision link1="l0" link2="l2"/><hand/><hand/>') == ALL - JOINED
     assert len(caught) == 1 and caught[0].filename == __file__
     known = "group group_state end_effector virtual_joint passive_joint joint_property link_sphere_approximation"
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         load_pairs("<!-- none -->" + "".join(f"<{tag}/>" for tag in known.split()))
 
 

@@ -307,8 +307,7 @@ def test_the_room_of_the_first_frame(device, monkeypatch):
     refused(ab.CapacityError, f"needed .*uncertain={needed}.*room for 8", frame.check)
     expected = coincident.intersect(output="count").count
     for capacity in (None, ab.Buffers(uncertain=needed)):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warnings.catch_warnings(action="error"):
             frame = ab.Pipeline(coincident, output="count", capacity=capacity)
         wp.capture_launch(frame.capture())
         frame.check()

@@ -331,8 +331,7 @@ def test_controllers_warn_of_floors_that_let_bodies_through(device):
             scene.add(model, static=True, name=("crate", None, None)[world], world=world)
         scene.add(ball, pose=(0, 0, 1, 0, 0, 0, 1))
         motion = ab.Dynamics(scene).motion()
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as caught:
             ab.Frame(scene, motion, ab.PredictiveController(scene, budget_ms=5.0))
             ab.Frame(scene, motion)
         told = [str(warning.message) for warning in caught if "fall through" in str(warning.message)]
