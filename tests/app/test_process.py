@@ -63,8 +63,7 @@ def ignore():
         signal.signal(number, signal.SIG_IGN)
 
 
-def block():
-    signal.pthread_sigmask(signal.SIG_BLOCK, BOTH)
+block = partial(signal.pthread_sigmask, signal.SIG_BLOCK, BOTH)
 
 
 @pytest.fixture

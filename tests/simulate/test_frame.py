@@ -247,17 +247,12 @@ def test_nothing_is_loaded_after_the_warm_up(device, kind):
     assert changed >= 3 and hits > 0
 
 
-def motion_of(worlds):
-    """Return the motion of the objects of some worlds and of one, the last, that is in all of them."""
-    rng = np.random.default_rng(7)
+def run_worlds(device, worlds, kind, moved):
+    """Run some of three worlds with an object that is in all; return LODs, pairs and hits by world and frame."""
+    rng, scene = np.random.default_rng(7), ab.Scene(device)
     rows = [(rng.uniform(-0.8, 0.8, (4, 3)), rng.uniform(-1, 1, (4, 3)), rng.uniform(1, 3, 4)) for _ in range(3)]
     place, velocity, rate = (np.concatenate([*(rows[w][k] for w in worlds), 0 * rows[0][k][:1]]) for k in range(3))
-    return ab.Kinematic(place, velocity=velocity, axis=(1, 2, 3), rate=rate)
-
-
-def run_worlds(device, worlds, kind, moved):
-    """Run some of three worlds together; return LODs, pairs and hits by world and frame."""
-    scene, motion = ab.Scene(device=device), motion_of(worlds)
+    motion = ab.Kinematic(place, velocity=velocity, axis=(1, 2, 3), rate=rate)
     for place, world in enumerate(worlds):
         for i in range(4):
             scene.add(ring_and_ball()[i % 2], world=place, importance=1 + (world + i) % 3)
