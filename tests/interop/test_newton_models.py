@@ -1,7 +1,8 @@
 """Newton's models in `NewtonContacts`: pairs, particles, worlds, order, match indices; nuts on bolts."""
 
-import importlib.util
+import runpy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -187,10 +188,7 @@ def test_collide_in_a_capture_launches_only(device):
 
 @pytest.fixture(scope="module")
 def scene():
-    spec = importlib.util.spec_from_file_location("newton_nut_and_bolt", SCENES / "newton_nut_and_bolt.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return SimpleNamespace(**runpy.run_path(str(SCENES / "newton_nut_and_bolt.py")))
 
 
 def make_nuts(scene, solver, device, count, hammer=0.0, tolerance=None):
