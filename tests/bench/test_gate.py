@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
+from helpers import refused
 
 import warp_abtree as ab
 from bench import __main__ as main
@@ -115,5 +116,4 @@ def test_the_command_appends_a_line_a_case(tmp_path, capsys, monkeypatch):
     with pytest.raises(SystemExit):
         main.main(asked)
     assert "a line is none of this command's" in capsys.readouterr().err
-    with pytest.raises(StudyError, match="no part nothing"):
-        nightly.run("cpu", tmp_path, only=["nothing"])
+    refused(StudyError, "no part nothing", nightly.run, "cpu", tmp_path, only=["nothing"])
