@@ -129,11 +129,6 @@ METHOD = "struct A {{\n    void f(int x) const {{\n{}    }}\n}};".format
 FUNCTION = "int f(int x) {{\n{}}}".format
 
 
-def twice(source):
-    """Return what a source defines that another defines too, which names its own things `f` and `MODULE_OPTIONS`."""
-    return rules.twice_defined({"a": parse(source), "b": parse("f = 2\nMODULE_OPTIONS = {}")})
-
-
 # The rules themselves: what finds their breaks, sources that break them, and sources that do not.
 RULES = {
     "direction": (
@@ -221,7 +216,7 @@ RULES = {
         ['"""Whichever: even-odd ray test.\n\nWhether a point is inside."""', "// Slabs.\n// How wide.\n"],
     ),
     "names of one meaning": (
-        twice,
+        lambda source: rules.twice_defined({"a": parse(source), "b": parse("f = 2\nMODULE_OPTIONS = {}")}),
         ["def f():\n    pass", "class f:\n    pass", "f = 1", "e, f = 1, 2", "e, (f, g) = x", "f: int = 1"],
         ["from a import f\n_f = 1\nMODULE_OPTIONS = {}\ndef h():\n    f = 1", "MODULE_OPTIONS = f.x = _f = 1"],
     ),

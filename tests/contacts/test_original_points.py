@@ -27,9 +27,10 @@ def wavy_plate():
 MODELS = wavy_plate()
 
 
-def world_triangles(model, pose):
-    vertices, faces = model.mesh_at(model.lod_max)[:2]
-    return posed(vertices, pose)[faces]
+def world_triangles(pose):
+    """Return the original faces of the plate, and of the ball at a pose."""
+    meshes = [model.mesh_at(model.lod_max)[:2] for model in MODELS]
+    return [posed(vertices, at)[faces] for (vertices, faces), at in zip(meshes, (np.array(FLOOR, float), pose))]
 
 
 def ask(device, pose, fraction, **options):
@@ -57,7 +58,7 @@ def test_points_lie_in_the_middle_of_both_originals(device, order):
         query, scene = ask(device, pose, 0.08, gap=GAP, originals=True)
         query.set_pairs([order])
         points = query.run().points
-        triangles = [world_triangles(*one) for one in zip(MODELS, (np.array(FLOOR, float), pose))]
+        triangles = world_triangles(pose)
         off += off_middle(points, triangles)
         coarse += off_middle(ab.ManifoldQuery(scene, [order], gap=GAP).run().points, triangles)
         assert (points["depth"] > -GAP).all()
@@ -96,8 +97,7 @@ def test_lods_and_poses_that_change_are_followed(device):
     scene.set_lods([int(0.1 * model.lod_max) for model in MODELS])
     points = query.run().points
     depth = points["depth"].max()
-    triangles = [world_triangles(*one) for one in zip(MODELS, (np.array(FLOOR, float), pose))]
-    assert 0 < np.max(off_middle(points, triangles)) < 0.01 * GAP
+    assert 0 < np.max(off_middle(points, world_triangles(pose))) < 0.01 * GAP
     pose[2] -= 0.005
     scene.set_poses([FLOOR, pose])
     again = query.run().points["depth"].max()

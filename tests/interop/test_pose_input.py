@@ -21,14 +21,10 @@ def poses_of(seed, count=6):
     return random_poses(np.random.default_rng(seed), count, 0.8)
 
 
-def expected(scene, poses):
-    """Answers of another scene, whose poses go through the host."""
-    other = scene_with(scene.device, *[(scene.models[0], pose) for pose in poses])
-    return other.intersect(other.broad_phase(), output="count")
-
-
 def assert_same(scene, query, poses, launch=True):
-    wanted = expected(scene, poses)
+    """Compare answers with those of another scene, whose poses go through the host."""
+    other = scene_with(scene.device, *[(scene.models[0], pose) for pose in poses])
+    wanted = other.intersect(other.broad_phase(), output="count")
     if launch:
         query.launch()
     pairs = query.pairs.numpy()[: query.pair_count.numpy()[0]]
