@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from helpers import refused
 from helpers.questions import in_a_row
-from helpers.samples import SHUTTLE_SCENE, STILL, sample
+from helpers.samples import STILL, sample
 from helpers.viewer import write_scene
 
 import warp_abtree as ab
@@ -18,8 +18,6 @@ from warp_abtree.app.cli.main import main
 from warp_abtree.lod.timing import WorkClock
 from warp_abtree.lod.view import Camera
 from warp_abtree.model.mesh import load_mesh
-
-SCENE = SHUTTLE_SCENE + '[[objects]]\nmodel = "ball"\ncount = 4\n'
 
 
 def balls(device="cpu", count=2):
