@@ -230,6 +230,7 @@ LIMITS = {
         (SWEPT + 'model = "ball"\n[lod]\nbudget_ms = 1\n', "lod: LODs are swept, or chosen by a controller"),
         (ONE + "[picture]\neye = [0, 2, 0]\n", "picture.up: points along eye"),
         (ONE + "kinematic = true\n", "objects[0].kinematic: the scene has no [dynamics]"),
+        (ONE + "density = 2\n[dynamics]\n", "objects[0].density: unknown key"),
         (ONE + "[dynamics]\nrestitution = 0.5\n", "dynamics.restitution: unknown key"),
         (ONE + "static = true\n[dynamics]\ncontinuous = true\n", "dynamics.continuous: no object is a rigid body"),
         (ONE + "static = true\nkinematic = true\n[dynamics]\n", "objects[0].kinematic: a static object"),

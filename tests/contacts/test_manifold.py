@@ -24,7 +24,7 @@ def clip_area_vector(half, pose, other_half, other_pose):
     part = trimesh.creation.box(2 * half, to_matrix(quaternion_matrix(pose[3:]), pose[:3]))
     for side, extent in zip(quaternion_matrix(other_pose[3:]).T, other_half):
         for inwards in (-side, side):
-            part = trimesh.intersections.slice_mesh_plane(part, inwards, other_pose[:3] - extent * inwards)
+            part = part.slice_plane(other_pose[:3] - extent * inwards, inwards)
     return (part.area_faces[:, None] * part.face_normals).sum(0)
 
 
