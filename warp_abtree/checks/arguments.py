@@ -1,11 +1,14 @@
 """Checks of what a caller hands in: one clear error that names what and where, before anything is changed."""
 
 import os
+from textwrap import shorten
 
 import numpy as np
 import warp as wp
 
 from warp_abtree.checks.upload import view_memory
+
+SHOWN_LENGTH = 100  # of what was given, in a message
 
 # Process in which the library first looked for a device, and so started Warp.
 _started_in: int | None = None
@@ -118,7 +121,7 @@ def finite_array(values, what: str, shape: tuple) -> np.ndarray:
     array = to_numpy(values, what).astype(np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         wanted = "a finite number" if shape == () else f"{' by '.join(map(str, shape))} finite numbers"
-        raise ValueError(f"{what}: {values!r} is not {wanted}")
+        raise ValueError(f"{what}: {shorten(repr(values), SHOWN_LENGTH)} is not {wanted}")
     return array
 
 
