@@ -13,10 +13,11 @@ Gaps and speeds err by `slack` and `speed_slack`, which also cover the dot produ
 root's is covered by `EARLIER`, 2^-40 of the step, and that of the time after it by `TIME_DOWN`.
 """
 
+from typing import Any
+
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import Trees, load_vertex
-from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.motion.path import Motion, across, place_motion, reverse_moment
 from warp_abtree.kernels.triangle.distance import corners_type
 from warp_abtree.kernels.triangle.float64_filter import float64_filter_triangles
@@ -289,19 +290,15 @@ def advance_once(
 
 
 @wp.func
-def advance_pair(
-    tolerance: wp.float64,
-    trees: Trees,
-    pose: PairPose,
-    motion: Motion,
-    faces: wp.vec2i,
-    before: PairProgress,
-    best: wp.float64,
-):
-    """Advance a face of A and one of B that are apart until a time; return the outcome, and the progress.
+def advance_pair(trees: Trees, given: Any, p: wp.int32, faces: wp.vec2i, before: PairProgress, best: wp.float64):
+    """Advance a face of A and one of B, of an object pair, that are apart until a time.
 
-    They go on where `before` says that a step is enough.
+    They go on where `before` says that a step is enough. Returns the outcome, and the steps made.
+
+    Args:
+        given: `kinds.motion_given`.
     """
+    pose, motion = given.batch.poses[p], given.motion[p]
     a = load_face(trees, pose.corner_a + faces[0])
     b = load_face(trees, pose.corner_b + faces[1])
     base, mover = wp.where(motion.base == 0, a, b), wp.where(motion.base == 0, b, a)
@@ -310,7 +307,7 @@ def advance_pair(
     t, steps = wp.float64(0.0) + before.time, wp.int32(0) + before.steps
     going = bool(True)
     while going:
-        contact = advance_once(tolerance, motion, base, mover, bend, t, best, before.mode == NORMALS)
+        contact = advance_once(given.tolerance, motion, base, mover, bend, t, best, before.mode == NORMALS)
         going = contact.end == IN_PROGRESS and before.mode == TO_THE_END
         if contact.end == IN_PROGRESS:
             # Normals alone may lead nowhere, which is no step.

@@ -13,7 +13,7 @@ from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.counters import add_warp_sum
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.lanes import next_place, warp_any, warp_lane, warp_min, warp_size, warp_sync
-from warp_abtree.kernels.base.poses import PairBatch, PairPose
+from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import (
     CLEAR,
@@ -25,8 +25,7 @@ from warp_abtree.kernels.motion.face_pair import (
     FirstContact,
     PairProgress,
 )
-from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
-from warp_abtree.kernels.motion.linear import EndPoses
+from warp_abtree.kernels.motion.kinds import STEPS, motion_given
 from warp_abtree.kernels.motion.start import OPEN, FirstContacts
 from warp_abtree.kernels.search.best_first import BestFirstPolicy, Entry, SearchLists, best_first, start_lists
 from warp_abtree.kernels.search.item import Emitted, first_item, item_first, item_second
@@ -77,20 +76,6 @@ def write_time(items: wp.uint64, i: wp.int32, time: wp.float64):
 MOTION_MEMORY = SearchMemory(MOTION_STACK_LENGTH, GOING_START, -1, read_tag, read_slot, write_entry)
 
 
-@cache
-def motion_given(kind):
-    """Return the struct of what searches for first contacts are given, for motions of a kind."""
-
-    @wp.struct
-    class MotionGiven:
-        tolerance: wp.float64  # of times
-        batch: PairBatch  # the object pairs
-        poses: EndPoses  # of objects
-        motion: wp.array(dtype=kind)  # of each object pair
-
-    return MotionGiven
-
-
 @wp.struct
 class Group:
     """Object pairs that a warp searches, a slot each."""
@@ -132,8 +117,9 @@ def take_contacts(group: wp.ref[Group], slot: wp.int32, own: FirstContact):
 
 @cache
 def group_policy(kind) -> BestFirstPolicy:
-    """Return the policy of warps for motions of a kind."""
+    """Return the policy of warps for motions of a type."""
     given_type = motion_given(kind)
+    _, advance_nodes, advance_faces = STEPS[kind]
 
     @wp.func
     def expand(trees: Trees, given: given_type, group: wp.ref[Group], entry: Entry):
@@ -164,9 +150,7 @@ def group_policy(kind) -> BestFirstPolicy:
         if live:
             p = group.first + entry.slot
             faces = wp.vec2i(item_first(entry.item), item_second(entry.item))
-            own, steps = advance_faces(
-                given.tolerance, trees, given.poses, given.batch.poses[p], given.motion[p], faces, progress, best
-            )
+            own, steps = advance_faces(trees, given, p, faces, progress, best)
         count_in(group.faces, entry.slot, wp.where(live and not goes_on, 1, 0))
         take_contacts(group, entry.slot, own)
         more = own.end == IN_PROGRESS and own.time <= time_of(group, entry.slot)
@@ -206,7 +190,7 @@ def start_group(
 
 @cache
 def warp_motion_search(kind):
-    """Return the kernel of warps for motions of a kind: `path.Motion` or `linear.LinearMotion`."""
+    """Return the kernel of warps for motions of a type: `path.Motion` or `linear.LinearMotion`."""
     policy = group_policy(kind)
     search_group, given_type = best_first(policy), policy.given
 
@@ -214,30 +198,22 @@ def warp_motion_search(kind):
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, launch_bounds=(32, 14))
     def search_warp_kernel(
         room: wp.int32,
-        tolerance: wp.float64,
         trees: Trees,
-        poses: EndPoses,
-        batch: PairBatch,
-        motion: wp.array(dtype=kind),
+        given: given_type,
         hits_inout: Hits,
         contacts_inout: FirstContacts,
     ):
         """Search the object pairs that are open, a few a warp."""
-        count = batch.count[0]
+        count = given.batch.count[0]
         size = wp.where(count >= GROUPED_LEAST, GROUP, 1)
         first = size * (wp.tid() / warp_size())
-        if first >= count or batch.launched[0] == STALE:
+        if first >= count or given.batch.launched[0] == STALE:
             return
         lists = start_lists(motion_stack(), wp.where(room < STACK_LENGTH, room, MOTION_STACK_LENGTH))
-        group, roots = start_group(lists.items, first, size, count, trees.states, batch.poses, contacts_inout)
+        group, roots = start_group(lists.items, first, size, count, trees.states, given.batch.poses, contacts_inout)
         if roots == 0:
             return
         lists.end = roots
-        given = given_type()
-        given.tolerance = tolerance
-        given.batch = batch
-        given.poses = poses
-        given.motion = motion
         search_group(trees, given, group, lists)
         for k in range(4):
             p = first + k

@@ -7,11 +7,12 @@ grows at a rate s stays open until g + s h = 0; of faces it is taken for each of
 `path`; in float32 both boxes have an image now, each as wide as the margin there says.
 """
 
+from typing import Any
+
 import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, StatePool, Trees
-from warp_abtree.kernels.base.boxes import pose_box
 from warp_abtree.kernels.base.nodes import Node, load_node
 from warp_abtree.kernels.base.poses import ROUNDING_32, SCALE_MAX, PairPose, reach_box
 from warp_abtree.kernels.motion.face_pair import (
@@ -21,6 +22,7 @@ from warp_abtree.kernels.motion.face_pair import (
     STEPS_MAX,
     TOUCHES,
     FirstContact,
+    PairProgress,
     axis_of,
     load_face,
     map_corners,
@@ -28,11 +30,11 @@ from warp_abtree.kernels.motion.face_pair import (
     step_along,
     time_after,
 )
-from warp_abtree.kernels.motion.node_pair import emit_later, longest_step
+from warp_abtree.kernels.motion.node_pair import MovingBox, emit_later, longest_step, move_box
 from warp_abtree.kernels.motion.path import BEND_LEAST
 from warp_abtree.kernels.motion.stalled import plain_row, posed_row, resolve_in_double_words, words_type
 from warp_abtree.kernels.search.item import load_node_pairs
-from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, POSE_ROUNDING, corners_type, largest_coordinate
+from warp_abtree.kernels.triangle.distance import POSE_ROUNDING, corners_type, largest_coordinate, power_below
 from warp_abtree.kernels.triangle.float64_filter import float64_filter_triangles
 
 wp.set_module_options(native.options("exact/apart_until.cuh", "exact/determinant.cuh"))
@@ -61,32 +63,12 @@ class LinearMotion:
 
 
 @wp.struct
-class EndPoses:
-    """Poses of all objects, as in `ObjectPool`: where motions start and end."""
-
-    rotation: wp.array(dtype=wp.mat33d)  # at first
-    position: wp.array(dtype=wp.vec3d)  # at first
-    end_rotation: wp.array(dtype=wp.mat33d)  # at last
-    end_position: wp.array(dtype=wp.vec3d)  # at last
-
-
-@wp.struct
 class Image:
     """Boxes, or speeds of their points, along three axes: matrix x + shift, of A without one."""
 
     a: wp.mat33  # of A's boxes about its centre
     b: wp.mat33  # of B's
     shift: wp.vec3  # of B's centre from A's
-
-
-@wp.struct
-class Seen:
-    """A box along three axes, and its speed."""
-
-    sum: wp.vec3  # twice its centre
-    size: wp.vec3  # its width
-    speed: wp.vec3  # twice that of its centre
-    spread: wp.vec3  # twice what speeds of its points differ from that
 
 
 @wp.func
@@ -121,8 +103,7 @@ def bound_linear_motion(before: LinearMotion, states: StatePool, pose: PairPose,
     motion.slack = (two * POSE_ROUNDING + wp.float64(6.0) * skew) * sizes
     far = two * (largest_coordinate(motion.offset) + travel) + two * away
     most = wp.max(wp.max(reach_a, reach_b), far)
-    power = wp.cast(wp.cast(most, wp.int64) & EXPONENT_BITS, wp.float64)
-    motion.scale = wp.min(wp.float64(1.0) / power, SCALE_MAX)
+    motion.scale = wp.min(wp.float64(1.0) / power_below(most), SCALE_MAX)
     margin = motion.slack + two * ROUNDING_32 * ((reach_a + reach_b) + far)
     motion.margin = wp.float32(margin * motion.scale)
     # Ways differ from no matrix by more than 2 in any entry: speeds err by what coordinates do, twice.
@@ -131,24 +112,10 @@ def bound_linear_motion(before: LinearMotion, states: StatePool, pose: PairPose,
 
 
 @wp.func
-def see(node: Node, motion: LinearMotion, at: wp.mat33, shift: wp.vec3, way: wp.mat33, speed: wp.vec3) -> Seen:
-    s = wp.float32(motion.scale)
-    lower, upper = node.lower * s, node.upper * s
-    placed = pose_box(lower, upper, at, shift, motion.margin)
-    moved = pose_box(lower, upper, way, speed, motion.speed_margin)
-    seen = Seen()
-    seen.sum = placed.posed_sum
-    seen.size = placed.posed_size
-    seen.speed = moved.posed_sum
-    seen.spread = moved.posed_size
-    return seen
-
-
-@wp.func
-def compare(a: Seen, b: Seen, before: wp.vec2) -> wp.vec2:
+def compare(a: MovingBox, b: MovingBox, before: wp.vec2) -> wp.vec2:
     """Return the longest step and the widest gap along three axes, and of those found before."""
-    bend = wp.float32(BEND_LEAST)
-    return longest_step(b.sum - a.sum, a.size + b.size, b.speed - a.speed, a.spread + b.spread, bend, before)
+    between, reach = b.at.posed_sum - a.at.posed_sum, a.at.posed_size + b.at.posed_size
+    return longest_step(between, reach, b.speed - a.speed, a.spread + b.spread, wp.float32(BEND_LEAST), before)
 
 
 @wp.func
@@ -166,8 +133,9 @@ def steps_along(
 ):
     """Return the longest steps and widest gaps of four pairs of boxes along three axes, and of those before."""
     o = wp.vec3()
-    x0, x1 = see(a0, motion, at.a, o, way.a, o), see(a1, motion, at.a, o, way.a, o)
-    y0, y1 = see(b0, motion, at.b, at.shift, way.b, way.shift), see(b1, motion, at.b, at.shift, way.b, way.shift)
+    x0, x1 = move_box(a0, motion, at.a, o, way.a, o), move_box(a1, motion, at.a, o, way.a, o)
+    y0 = move_box(b0, motion, at.b, at.shift, way.b, way.shift)
+    y1 = move_box(b1, motion, at.b, at.shift, way.b, way.shift)
     p00, p01 = compare(x0, y0, wp.vec2(s[0], g[0])), compare(x0, y1, wp.vec2(s[1], g[1]))
     p10, p11 = compare(x1, y0, wp.vec2(s[2], g[2])), compare(x1, y1, wp.vec2(s[3], g[3]))
     return wp.vec4(p00[0], p01[0], p10[0], p11[0]), wp.vec4(p00[1], p01[1], p10[1], p11[1])
@@ -287,36 +255,46 @@ def posed_corners(
 
 @wp.func(inline=False)
 def resolve_in_world(
-    poses: EndPoses, pair: wp.vec2i, a: corners_type, b: corners_type, start: wp.float64, best: wp.float64
+    rotation: wp.array(dtype=wp.mat33d),
+    position: wp.array(dtype=wp.vec3d),
+    end_rotation: wp.array(dtype=wp.mat33d),
+    end_position: wp.array(dtype=wp.vec3d),
+    pair: wp.vec2i,
+    a: corners_type,
+    b: corners_type,
+    start: wp.float64,
+    best: wp.float64,
 ):
     """Return the `FirstContact` of faces of models, see `stalled`."""
-    starts, first = posed_corners(poses.rotation, poses.position, pair, a, b)
-    ends, last = posed_corners(poses.end_rotation, poses.end_position, pair, a, b)
+    starts, first = posed_corners(rotation, position, pair, a, b)
+    ends, last = posed_corners(end_rotation, end_position, pair, a, b)
     return resolve_in_double_words(starts, ends, POSED_WORDS * wp.max(first, last), start, best)
 
 
 @wp.func
-def advance_linear_pair(
-    tolerance: wp.float64,
-    trees: Trees,
-    poses: EndPoses,
-    pose: PairPose,
-    motion: LinearMotion,
-    face_a: wp.int32,
-    face_b: wp.int32,
-    start: wp.float64,
-    best: wp.float64,
-):
-    """Return the `FirstContact` of a face of A and one of B."""
-    a = load_face(trees, pose.corner_a + face_a)
-    b = load_face(trees, pose.corner_b + face_b)
+def advance_linear_pair(trees: Trees, given: Any, p: wp.int32, faces: wp.vec2i, before: PairProgress, best: wp.float64):
+    """Advance a face of A and one of B to the end, as `face_pair.advance_pair`; steps are not counted."""
+    pose, motion = given.batch.poses[p], given.motion[p]
+    a = load_face(trees, pose.corner_a + faces[0])
+    b = load_face(trees, pose.corner_b + faces[1])
     way_a = map_corners(motion.way_a, motion.shift_a, a)
     way_b = map_corners(motion.way_b, motion.shift_b, b)
     at_b = map_corners(motion.first, motion.offset, b)
-    contact = advance_straight(tolerance, motion.slack, a, at_b, way_a, way_b, start, best)
+    contact = advance_straight(given.tolerance, motion.slack, a, at_b, way_a, way_b, before.time, best)
     if contact.end == STALLED:
-        contact = resolve_in_world(poses, motion.objects, a, b, contact.time, best)
-    return contact
+        objects, ends = trees.objects, given.ends
+        contact = resolve_in_world(
+            objects.rotation,
+            objects.position,
+            ends.rotation,
+            ends.position,
+            motion.objects,
+            a,
+            b,
+            contact.time,
+            best,
+        )
+    return contact, wp.int32(0)
 
 
 @wp.kernel

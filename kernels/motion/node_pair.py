@@ -11,13 +11,15 @@ in coordinates, by 9 u of the sizes added up; twice that is allowed for. The roo
 numbers that are not negative, so it errs by 8 u of itself, and `LATER` takes off 16 u.
 """
 
+from typing import Any
+
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import StatePool
 from warp_abtree.kernels.base.boxes import PosedBox, pose_box
 from warp_abtree.kernels.base.nodes import Node
 from warp_abtree.kernels.base.poses import PairPose
-from warp_abtree.kernels.motion.path import Moment, Motion
+from warp_abtree.kernels.motion.path import Moment, Motion, place_motion
 from warp_abtree.kernels.search.item import (
     DROPPED,
     FACES,
@@ -77,9 +79,8 @@ def box_motion(motion: Motion, m: Moment):
 
 
 @wp.func
-def move_box(
-    node: Node, motion: Motion, rotation: wp.mat33, shift: wp.vec3, spin: wp.mat33, speed: wp.vec3
-) -> MovingBox:
+def move_box(node: Node, motion: Any, rotation: wp.mat33, shift: wp.vec3, spin: wp.mat33, speed: wp.vec3):
+    """Return a node's box in motion, from its pose and the speeds of its points about the models' centres."""
     s = wp.float32(motion.scale)
     lower, upper = node.lower * s, node.upper * s
     moved = pose_box(lower, upper, spin, speed, motion.speed_margin)
@@ -173,13 +174,13 @@ def advance_children(
     states: StatePool,
     pose: PairPose,
     motion: Motion,
-    boxes: BoxMotion,
     t: wp.float32,
     best: wp.float64,
     item: wp.int64,
     live: wp.int32,
 ):
     """Expand an item from time t on, as `load_node_pairs` and `emit_later`."""
+    boxes = box_motion(motion, place_motion(motion, wp.float64(t)))
     pairs = load_node_pairs(states, pose, item, live)
     home, spin = wp.transpose(boxes.rotation), wp.transpose(boxes.spin)
     box_a0 = move_box(pairs.a0, motion, home, boxes.back, spin, boxes.back_speed)

@@ -33,7 +33,7 @@ from warp_abtree.kernels.base.arrays import ObjectPool, StatePool, Trees
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import ROUNDING_32, SCALE_MAX, PairPose, measure_rotation, reach_box, sum_products
 from warp_abtree.kernels.motion.turn import shortest_turn, turn_matrix
-from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, POSE_ROUNDING, largest_coordinate
+from warp_abtree.kernels.triangle.distance import POSE_ROUNDING, largest_coordinate, power_below
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -46,14 +46,14 @@ BEND_LEAST = wp.constant(wp.float64(2.0**-80))
 
 
 @wp.struct
-class Paths:
-    """Paths of objects, shape [object]."""
+class Path:
+    """Path of an object."""
 
-    axis: wp.array(dtype=wp.vec3d)  # of its turn, unit, model frame
-    angle: wp.array(dtype=wp.float64)  # of its turn, 0 to pi; -1 where there is no shortest turn
-    anchor: wp.array(dtype=wp.vec3d)  # the point that moves straight [model units]
-    start: wp.array(dtype=wp.vec3d)  # where that is at first [world units]
-    travel: wp.array(dtype=wp.vec3d)  # its way [world units]
+    axis: wp.vec3d  # of its turn, unit, model frame
+    angle: wp.float64  # of its turn, 0 to pi; -1 where there is no shortest turn
+    anchor: wp.vec3d  # the point that moves straight [model units]
+    start: wp.vec3d  # where that is at first [world units]
+    travel: wp.vec3d  # its way [world units]
 
 
 @wp.struct
@@ -180,24 +180,24 @@ def bend_of(
 
 
 @wp.func
-def start_motion(paths: Paths, trees: Trees, pair: wp.vec2i):
+def start_motion(paths: wp.array(dtype=Path), trees: Trees, pair: wp.vec2i):
     """Return the `Motion` of objects a < b; its base, bounds and margins are those of `bound_motion`."""
     a, b = pair[0], pair[1]
     ra, rb = trees.objects.rotation[a], trees.objects.rotation[b]
-    shift = paths.start[b] - paths.start[a]
-    travel = paths.travel[b] - paths.travel[a]
+    of_a, of_b = paths[a], paths[b]
+    shift, travel = of_b.start - of_a.start, of_b.travel - of_a.travel
     motion = Motion()
     for i in range(3):
         motion.d0[i] = sum_products(ra[0, i], shift[0], ra[1, i], shift[1], ra[2, i], shift[2])
         motion.d1[i] = sum_products(ra[0, i], travel[0], ra[1, i], travel[1], ra[2, i], travel[2])
         for j in range(3):
             motion.first[i, j] = sum_products(ra[0, i], rb[0, j], ra[1, i], rb[1, j], ra[2, i], rb[2, j])
-    motion.anchor_a = paths.anchor[a]
-    motion.anchor_b = paths.anchor[b]
-    motion.axis_a = paths.axis[a]
-    motion.axis_b = paths.axis[b]
-    motion.angle_a = paths.angle[a]
-    motion.angle_b = paths.angle[b]
+    motion.anchor_a = of_a.anchor
+    motion.anchor_b = of_b.anchor
+    motion.axis_a = of_a.axis
+    motion.axis_b = of_b.axis
+    motion.angle_a = of_a.angle
+    motion.angle_b = of_b.angle
     if motion.angle_b < wp.float64(0.0):
         motion.angle_a = motion.angle_b
     motion.centre_a = trees.models.centre[trees.states.model[trees.objects.state[a]]]
@@ -246,8 +246,7 @@ def bound_motion(before: Motion, states: StatePool, pose: PairPose, skew: wp.flo
     # As `distance.frame.make_scale`, but for the whole way: centres are at most so far apart, and move so fast.
     far = two * (way + away)
     most = wp.max(wp.max(reach_a, reach_b), wp.max(far, travel))
-    power = wp.cast(wp.cast(most, wp.int64) & EXPONENT_BITS, wp.float64)
-    scale = wp.min(wp.float64(1.0) / power, SCALE_MAX)
+    scale = wp.min(wp.float64(1.0) / power_below(most), SCALE_MAX)
     margin = motion.slack + ROUNDING_32 * ((reach_a + reach_b) + far)
     speed_margin = motion.speed_slack + two * ROUNDING_32 * (turn * ((reach_a + reach_b) + far) + two * travel)
     motion.scale = scale
@@ -256,17 +255,6 @@ def bound_motion(before: Motion, states: StatePool, pose: PairPose, skew: wp.flo
     motion.bend_a = wp.float32(two * bend_a * scale * GROW + BEND_LEAST)
     motion.bend_b = wp.float32(two * bend_b * scale * GROW + BEND_LEAST)
     return motion
-
-
-@wp.struct
-class Path:
-    """One object's way, see `Paths`."""
-
-    axis: wp.vec3d  # of its turn, unit, model frame
-    angle: wp.float64  # of its turn, 0 to pi; -1 where there is no shortest turn
-    anchor: wp.vec3d  # the point that moves straight [model units]
-    start: wp.vec3d  # where that is at first [world units]
-    travel: wp.vec3d  # its way [world units]
 
 
 @wp.func
@@ -292,12 +280,7 @@ def make_path(screw: bool, objects: ObjectPool, ends: ObjectPool, i: wp.int32) -
 
 
 @wp.kernel
-def prepare_path_kernel(screw: bool, objects: ObjectPool, ends: ObjectPool, paths_out: Paths):
+def prepare_path_kernel(screw: bool, objects: ObjectPool, ends: ObjectPool, paths_out: wp.array(dtype=Path)):
     """Prepare an object's path a thread."""
     i = wp.tid()
-    path = make_path(screw, objects, ends, i)
-    paths_out.axis[i] = path.axis
-    paths_out.angle[i] = path.angle
-    paths_out.anchor[i] = path.anchor
-    paths_out.start[i] = path.start
-    paths_out.travel[i] = path.travel
+    paths_out[i] = make_path(screw, objects, ends, i)

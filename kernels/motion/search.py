@@ -12,12 +12,9 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.generation import STALE
-from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, TO_THE_END, TOUCHES, FirstContact, PairProgress
-from warp_abtree.kernels.motion.group import motion_given
-from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
-from warp_abtree.kernels.motion.linear import EndPoses
+from warp_abtree.kernels.motion.kinds import STEPS, motion_given
 from warp_abtree.kernels.motion.start import OPEN, FirstContacts
 from warp_abtree.kernels.search.best_first import BestFirstPolicy, Entry, SearchLists, best_first, start_lists
 from warp_abtree.kernels.search.item import Emitted, first_item, item_first, item_second
@@ -55,8 +52,9 @@ class ContactSearch:
 
 @cache
 def contact_policy(kind) -> BestFirstPolicy:
-    """Return the policy of threads for motions of a kind: face pairs are advanced to their end, one after the other."""
+    """Return the policy of threads for motions of a type: face pairs are advanced to their end, one after the other."""
     given_type = motion_given(kind)
+    _, advance_nodes, advance_faces = STEPS[kind]
 
     @wp.func
     def expand(trees: Trees, given: given_type, search: wp.ref[ContactSearch], entry: Entry):
@@ -77,9 +75,7 @@ def contact_policy(kind) -> BestFirstPolicy:
         progress.mode = TO_THE_END
         if progress.time <= best.time:
             faces = wp.vec2i(item_first(entry.item), item_second(entry.item))
-            own, _ = advance_faces(
-                given.tolerance, trees, given.poses, given.batch.poses[p], given.motion[p], faces, progress, best.time
-            )
+            own, _ = advance_faces(trees, given, p, faces, progress, best.time)
             if own.end != CLEAR and (own.time < best.time or (own.time == best.time and best.end != TOUCHES)):
                 # A pair that is undecided at the same time does not matter.
                 search.best = own
@@ -90,33 +86,25 @@ def contact_policy(kind) -> BestFirstPolicy:
 
 @cache
 def thread_motion_search(kind):
-    """Return the kernel of the CPU's threads for motions of a kind."""
+    """Return the kernel of the CPU's threads for motions of a type."""
     policy = contact_policy(kind)
     search_pair, given_type = best_first(policy), policy.given
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def search_thread_kernel(
-        tolerance: wp.float64,
         trees: Trees,
-        poses: EndPoses,
-        batch: PairBatch,
-        motion: wp.array(dtype=kind),
+        given: given_type,
         hits_inout: Hits,
         contacts_inout: FirstContacts,
         memory_out: wp.array2d(dtype=wp.int64),
     ):
         """Take one object pair after the other that is open, and search it; CPU only."""
-        if batch.launched[0] == STALE:
+        if given.batch.launched[0] == STALE:
             return
-        count = wp.min(batch.count[0], batch.poses.shape[0])
+        count = wp.min(given.batch.count[0], given.batch.poses.shape[0])
         thread = take_thread(contacts_inout.counter)
         if thread >= memory_out.shape[0]:
             return
-        given = given_type()
-        given.tolerance = tolerance
-        given.batch = batch
-        given.poses = poses
-        given.motion = motion
         lists = start_lists(thread_lists(memory_out, thread), STACK_LENGTH)
         p = take_unit(contacts_inout.counter)
         while p < count:
@@ -124,9 +112,8 @@ def thread_motion_search(kind):
                 search = ContactSearch()
                 search.pair = p
                 search.best.time = wp.float64(1.0)
-                write_bounded(
-                    lists.items, 0, first_item(trees.states, batch.poses[p]), wp.float32(contacts_inout.time[p]), 0
-                )
+                item = first_item(trees.states, given.batch.poses[p])
+                write_bounded(lists.items, 0, item, wp.float32(contacts_inout.time[p]), 0)
                 lists.end = 1
                 search_pair(trees, given, search, lists)
                 contacts_inout.time[p] = search.best.time

@@ -6,21 +6,20 @@ at the ends of all parts, each wider by that, hold it all.
 """
 
 from functools import cache
-from typing import Any
 
 import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, StatePool, Trees
-from warp_abtree.kernels.base.boxes import round_down, round_up
+from warp_abtree.kernels.base.boxes import round_down_vec, round_up_vec
 from warp_abtree.kernels.base.generation import STALE, LaunchRecord, is_stale
 from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import ROUNDING_64, PairBatch, PairPose, measure_skew
 from warp_abtree.kernels.intersect.broad_phase import PosedBounds, write_bounds
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED
-from warp_abtree.kernels.motion.kinds import advance_nodes, has_way, make_motion
-from warp_abtree.kernels.motion.path import Paths, make_path
+from warp_abtree.kernels.motion.kinds import STEPS
+from warp_abtree.kernels.motion.path import Path, make_path
 from warp_abtree.kernels.motion.turn import turn_matrix
 from warp_abtree.kernels.search.item import DROPPED, first_item
 
@@ -47,30 +46,30 @@ class FirstContacts:
 class Motions:
     """Paths and end poses of objects."""
 
-    paths: Paths  # the way of each
+    paths: wp.array(dtype=Path)  # shape [object]
     ends: ObjectPool  # their poses at the end
-
-
-@wp.func
-def advance_roots(states: StatePool, pose: PairPose, motion: Any):
-    """Advance two roots; return a time until which they stay apart, whether it is the end, and the tests made."""
-    t = wp.float32(0.0)
-    item = first_item(states, pose)
-    tests = wp.int32(0)
-    while tests < ROOT_STEPS:
-        emitted = advance_nodes(states, pose, motion, t, wp.float64(1.0), item, -1)
-        tests += 1
-        if emitted.kinds[0] == DROPPED:
-            return t, True, tests
-        if emitted.items[0] != item:
-            return t, False, tests
-        t = emitted.bounds[0]
-    return t, False, tests
 
 
 @cache
 def contact_starter(kind):
-    """Return the kernel that prepares object pairs for motions of a kind: `path.Motion` or `linear.LinearMotion`."""
+    """Return the kernel that prepares object pairs for motions of a type: `path.Motion` or `linear.LinearMotion`."""
+    make, advance_nodes, _ = STEPS[kind]
+
+    @wp.func
+    def advance_roots(states: StatePool, pose: PairPose, motion: kind):
+        """Advance two roots; return a time until which they stay apart, whether it is the end, and the tests made."""
+        t = wp.float32(0.0)
+        item = first_item(states, pose)
+        tests = wp.int32(0)
+        while tests < ROOT_STEPS:
+            emitted = advance_nodes(states, pose, motion, t, wp.float64(1.0), item, -1)
+            tests += 1
+            if emitted.kinds[0] == DROPPED:
+                return t, True, tests
+            if emitted.items[0] != item:
+                return t, False, tests
+            t = emitted.bounds[0]
+        return t, False, tests
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def start_contact_kernel(
@@ -93,11 +92,10 @@ def contact_starter(kind):
         if hits_inout.any_hit[p] != 0:
             contacts_inout.end[p] = TOUCHES
             return
-        motion = kind()
-        if not has_way(motion, motions.paths, pair):
+        motion, has_way = make(motions.paths, motions.ends, trees, batch.poses[p], pair)
+        if not has_way:
             contacts_inout.end[p] = HALF_TURN
             return
-        motion = make_motion(motion, motions.paths, motions.ends, trees, batch.poses[p], pair)
         if not (motion.slack < wp.float64(wp.inf)):
             # Beyond float64, or no numbers: nothing could be proved.
             contacts_inout.end[p] = UNDECIDED
@@ -162,8 +160,7 @@ def sweep_box_kernel(
             turned = r * turn_matrix(path.axis, t * path.angle)
             place = (path.start + t * path.travel) - turned * path.anchor
             low, high = extend_box(low, high, turned, place, middle, half, more + sag)
-    box_lower = wp.vec3(round_down(low[0]), round_down(low[1]), round_down(low[2]))
-    box_upper = wp.vec3(round_up(high[0]), round_up(high[1]), round_up(high[2]))
+    box_lower, box_upper = round_down_vec(low), round_up_vec(high)
     if is_stale(record):
         box_lower = wp.vec3(wp.float32(i), 0.0, 0.0)
         box_upper = box_lower

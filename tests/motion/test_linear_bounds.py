@@ -15,12 +15,11 @@ from warp_abtree.kernels.base.nodes import load_node
 from warp_abtree.kernels.base.poses import place_trees
 from warp_abtree.kernels.motion.linear import (
     LinearMotion,
-    Seen,
     bound_linear_motion,
     image_of,
-    see,
     start_linear_motion,
 )
+from warp_abtree.kernels.motion.node_pair import MovingBox, move_box
 from warp_abtree.kernels.motion.path import pair_skew
 
 pytestmark = pytest.mark.skipif(not HAS_LONG, reason="no floating-point numbers longer than float64")
@@ -32,8 +31,8 @@ class View:
     """A motion, and the root boxes at a time along the axes of A's first frame."""
 
     motion: LinearMotion
-    box_a: Seen
-    box_b: Seen
+    box_a: MovingBox
+    box_b: MovingBox
 
 
 @wp.kernel(module="unique", module_options=native.options())
@@ -49,8 +48,8 @@ def view_kernel(ends: ObjectPool, trees: Trees, times: wp.array(dtype=wp.float64
     way = image_of(m.way_a, m.way_b, speed, m.scale)
     view = View()
     view.motion = m
-    view.box_a = see(load_node(trees.states, pose.node_a + 1), m, at.a, o, way.a, o)
-    view.box_b = see(load_node(trees.states, pose.node_b + 1), m, at.b, at.shift, way.b, way.shift)
+    view.box_a = move_box(load_node(trees.states, pose.node_a + 1), m, at.a, o, way.a, o)
+    view.box_b = move_box(load_node(trees.states, pose.node_b + 1), m, at.b, at.shift, way.b, way.shift)
     view_out[i] = view
 
 
@@ -118,7 +117,7 @@ def test_margins_of_straight_boxes_cover_float32(device, name):
     scale = 2 * motion["scale"].astype(LONG)[:, None]
     for k, box in enumerate((case.view["box_a"], case.view["box_b"])):
         for true, middle, width, margin in (
-            (case.places[k] - case.middle, box["sum"], box["size"], motion["margin"]),
+            (case.places[k] - case.middle, box["at"]["posed_sum"], box["at"]["posed_size"], motion["margin"]),
             (case.ways[k] - case.drift, box["speed"], box["spread"], motion["speed_margin"]),
         ):
             low, high = scale * true.min(1), scale * true.max(1)

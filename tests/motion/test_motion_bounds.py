@@ -21,7 +21,7 @@ from warp_abtree.kernels.motion.node_pair import MovingBox, box_motion, move_box
 from warp_abtree.kernels.motion.path import (
     Moment,
     Motion,
-    Paths,
+    Path,
     bound_motion,
     pair_skew,
     place_motion,
@@ -46,7 +46,9 @@ class Seen:
 
 
 @wp.kernel(module="unique", module_options=native.options())
-def see_kernel(paths: Paths, trees: Trees, times: wp.array(dtype=wp.float64), seen_out: wp.array(dtype=Seen)):
+def see_kernel(
+    paths: wp.array(dtype=Path), trees: Trees, times: wp.array(dtype=wp.float64), seen_out: wp.array(dtype=Seen)
+):
     i = wp.tid()
     a, b = 2 * i, 2 * i + 1
     pose = place_trees(trees, trees.objects.state[a], trees.objects.state[b])
@@ -74,17 +76,16 @@ class Case:
     def __init__(self, rng, device, models, starts, ends, screw=False, turns=None):
         scene = scene_with(device, *zip(models, starts, strict=True))
         query, count = ab.FirstContactQuery(scene, ends, np.arange(len(models)).reshape(-1, 2)), len(models)
-        trees, paths = query.batch.trees, Paths()
-        for name in ("axis", "angle", "anchor", "start", "travel"):
-            setattr(paths, name, wp.zeros(count, dtype=wp.float64 if name == "angle" else wp.vec3d, device=device))
+        trees, paths = query.batch.trees, wp.zeros(count, dtype=Path, device=device)
         wp.launch(prepare_path_kernel, count, [screw, trees.objects, query.ends, paths], device=device)
         self.times = rng.uniform(size=count // 2)
         self.seen = launch(see_kernel, device, count // 2, paths, trees, self.times)
-        anchor, start, travel = (getattr(paths, name).numpy() for name in ("anchor", "start", "travel"))
+        made = paths.numpy()
+        anchor, start, travel = (made[name] for name in ("anchor", "start", "travel"))
         if not screw:
             start, end = trees.objects.position.numpy().astype(LONG), query.ends.position.numpy().astype(LONG)
             travel = end - start
-        self.own_turns = paths.axis.numpy(), paths.angle.numpy()
+        self.own_turns = made["axis"], made["angle"]
         self._frames = trees.objects.rotation.numpy(), anchor, start, travel
         boxes = np.array([model.mesh_at(model.lod_max)[0] for model in models])
         self.corners = boxes[0::2], boxes[1::2]

@@ -26,10 +26,9 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, flag, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.checks.upload import zeros_of
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.lanes import WARP_SIZE
-from warp_abtree.kernels.motion import face_pair, group, path, search, start
+from warp_abtree.kernels.motion import face_pair, group, kinds, path, search, start
 from warp_abtree.kernels.motion import linear as straight
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.operator import Operator
@@ -104,7 +103,8 @@ class FirstContactStage(Stage):
         device, batch, placed = operator.device, operator.batch, operator.batch.objects.pool
         self.contacts.counter = wp.zeros(CONTACT_COUNTERS, dtype=wp.int32, device=device)
         self.ends.rotation, self.ends.position = wp.clone(placed.rotation), wp.clone(placed.position)
-        self._motions.paths, self._motions.ends = zeros_of(path.Paths, batch.object_count, 0, device), self.ends
+        self._motions.paths = wp.zeros(batch.object_count, dtype=path.Path, device=device)
+        self._motions.ends = self.ends
 
     def kernels(self, device) -> list:
         """Return what makes motions and follows them."""
@@ -154,11 +154,10 @@ class FirstContactStage(Stage):
         return [paths, launch(starter, dim=operator.rooms.pairs, inputs=inputs, block_dim=WARP_SIZE)]
 
     def _make_contacts(self, launch) -> list:
-        operator, objects, poses = self.operator, self.operator.batch.objects.pool, straight.EndPoses()
-        poses.rotation, poses.position = objects.rotation, objects.position
-        poses.end_rotation, poses.end_position = self.ends.rotation, self.ends.position
-        inputs = [self.tolerance, operator.batch.trees, poses, operator.pair_batch, self.motion]
-        inputs += [operator.hits, self.contacts]
+        operator, given = self.operator, kinds.motion_given(self._kind)()
+        given.tolerance, given.batch = self.tolerance, operator.pair_batch
+        given.ends, given.motion = self.ends, self.motion
+        inputs = [operator.batch.trees, given, operator.hits, self.contacts]
         if not operator.uses_warps():
             kernel = search.thread_motion_search(self._kind)
             return [launch(kernel, dim=1, inputs=[*inputs, self.memory], device=operator.device)]
