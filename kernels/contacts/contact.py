@@ -3,16 +3,16 @@
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees, load_vertex
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
 from warp_abtree.kernels.base.lanes import warp_lane, warp_size
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.exact.expansion import EXPANSION_LANES
 from warp_abtree.kernels.intersect.uncertain_pairs import items_at_once
-from warp_abtree.kernels.triangle.corners import load_corner_ids, load_corners
+from warp_abtree.kernels.triangle.corners import load_corner_ids, load_corners, load_face_pair
 from warp_abtree.kernels.triangle.segment import (
     face_normal,
-    filter_normal,
-    filter_segment,
+    find_normal,
+    find_segment,
     intersect_faces,
     unit_vector,
 )
@@ -146,17 +146,10 @@ def find_contact_kernel(
     own = contact_objects(batch, p)
     a = load_corner_ids(trees.states, batch.poses[p].corner_a + faces[i][1 + own.swapped])
     b = load_corner_ids(trees.states, batch.poses[p].corner_b + faces[i][2 - own.swapped])
-    rotation = batch.poses[p].rotation
-    shift = batch.poses[p].translation
-    a0 = load_vertex(trees.models.vertex_pos, a[0])
-    a1 = load_vertex(trees.models.vertex_pos, a[1])
-    a2 = load_vertex(trees.models.vertex_pos, a[2])
-    b0 = pose_point(rotation, shift, load_vertex(trees.models.vertex_pos, b[0]))
-    b1 = pose_point(rotation, shift, load_vertex(trees.models.vertex_pos, b[1]))
-    b2 = pose_point(rotation, shift, load_vertex(trees.models.vertex_pos, b[2]))
-    normal_a, sure_a = filter_normal(a0, a1, a2)
-    normal_b, sure_b = filter_normal(b0, b1, b2)
-    p0, p1, sure = filter_segment(proven, a0, a1, a2, b0, b1, b2)
+    a0, a1, a2, b0, b1, b2 = load_face_pair(trees.models, batch.poses[p], a, b)
+    normal_a, normal_b, p0, p1 = wp.vec3d(), wp.vec3d(), wp.vec3d(), wp.vec3d()
+    sure_a, sure_b = find_normal(a0, a1, a2, normal_a), find_normal(b0, b1, b2, normal_b)
+    sure = find_segment(proven, wp.matrix_from_rows(a0, a1, a2), wp.matrix_from_rows(b0, b1, b2), p0, p1)
     if sure and sure_a and sure_b:
         write_contact(trees, own, i, p0, p1, normal_a, normal_b, contacts_out)
         contacts_out.coplanar[i] = 0

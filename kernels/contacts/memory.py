@@ -39,6 +39,28 @@ TOUCH_SHARE = wp.constant(wp.float64(2.0**-40))
 
 
 @wp.struct
+class SearchedPair:
+    """An object pair when it was searched. In this order nothing is padded."""
+
+    rotation: wp.mat33d  # of B in A's frame, A the lower object
+    translation: wp.vec3d  # the same
+    gap: wp.float64  # within which points were [world units]
+    lods: wp.vec2i  # of both objects
+    any_hit: wp.int32  # as of `Hits`
+    count: wp.int32  # points
+
+
+@wp.struct
+class KeptPoint:
+    """A contact point when its pair was searched."""
+
+    on_a: wp.vec3d  # [units of A's model], A's frame
+    on_b: wp.vec3d  # [units of B's model], B's frame
+    normal: wp.vec3d  # from the pair's first object to its second, A's frame
+    depth: wp.float64  # [world units]
+
+
+@wp.struct
 class PointMemory:
     """Points of the last search of object pairs, in two tables."""
 
@@ -46,16 +68,8 @@ class PointMemory:
     known: wp.array(dtype=wp.int32)  # pairs in it, shape [1]
     launches: wp.array(dtype=wp.int32)  # that have written a table, shape [1]
     pairs: wp.array2d(dtype=wp.vec2i)  # in the order of the launch, shape [2, pair]
-    lods: wp.array2d(dtype=wp.vec2i)  # of both objects when they were searched, shape [2, pair]
-    gap: wp.array2d(dtype=wp.float64)  # within which they were [world units], shape [2, pair]
-    rotation: wp.array2d(dtype=wp.mat33d)  # of B in A's frame then, A the lower object, shape [2, pair]
-    translation: wp.array2d(dtype=wp.vec3d)  # shape [2, pair]
-    any_hit: wp.array2d(dtype=wp.int32)  # as of `Hits` then, shape [2, pair]
-    count: wp.array2d(dtype=wp.int32)  # points, shape [2, pair]
-    point_a: wp.array3d(dtype=wp.vec3d)  # [units of A's model], A's frame, shape [2, pair, points]
-    point_b: wp.array3d(dtype=wp.vec3d)  # [units of B's model], B's frame, shape [2, pair, points]
-    normal: wp.array3d(dtype=wp.vec3d)  # from the pair's first object to its second, A's frame, shape [2, pair, points]
-    depth: wp.array3d(dtype=wp.float64)  # [world units] then, shape [2, pair, points]
+    searched: wp.array2d(dtype=SearchedPair)  # shape [2, pair]
+    points: wp.array3d(dtype=KeptPoint)  # shape [2, pair, points]
     shown: wp.array3d(dtype=wp.int32)  # place among those of the last launch, -1 for none, shape [2, pair, points]
 
 
@@ -149,14 +163,15 @@ def find_resting_kernel(
     row_out[p] = m
     if m < 0:
         return
-    if not (memory.lods[turn, m] == lods_of(trees, pair)):
+    before = memory.searched[turn, m]
+    if not (before.lods == lods_of(trees, pair)):
         return
     a, b = wp.min(pair[0], pair[1]), wp.max(pair[0], pair[1])
     limit = wp.float64(rest.distance)
     if limit < wp.float64(0.0):
         limit = wp.min(GAP_SHARE * gap[p], SIZE_SHARE * smaller_size(trees, a, b))
-    moved = farthest_motion(trees, a, b, memory.rotation[turn, m], memory.translation[turn, m])
-    if moved + wp.max(gap[p] - memory.gap[turn, m], wp.float64(0.0)) <= limit:
+    moved = farthest_motion(trees, a, b, before.rotation, before.translation)
+    if moved + wp.max(gap[p] - before.gap, wp.float64(0.0)) <= limit:
         place_out[p] = m
         asked_out[p] = -wp.float64(wp.inf)
 
@@ -170,20 +185,20 @@ def resume_resting_kernel(batch: PairBatch, place: wp.array(dtype=wp.int32), mem
     """
     p = wp.tid()
     if p < wp.min(batch.count[0], batch.pairs.shape[0]) and place[p] >= 0:
-        hits_inout.any_hit[p] = memory.any_hit[memory.turn[0], place[p]]
+        hits_inout.any_hit[p] = memory.searched[memory.turn[0], place[p]].any_hit
 
 
 @wp.func
 def recall_point(trees: Trees, batch: PairBatch, p: wp.int32, m: wp.int32, k: wp.int32, memory: PointMemory):
     """Return where point k of row m is now, of pair p, with its normal and its depth."""
-    turn, pair = memory.turn[0], batch.pairs[p]
+    pair, kept = batch.pairs[p], memory.points[memory.turn[0], m, k]
     a, b = wp.min(pair[0], pair[1]), wp.max(pair[0], pair[1])
     rotation = trees.objects.rotation[a]
-    of_a = pose_point(rotation, trees.objects.position[a], memory.point_a[turn, m, k])
-    of_b = pose_point(trees.objects.rotation[b], trees.objects.position[b], memory.point_b[turn, m, k])
-    n = rotation * memory.normal[turn, m, k]
+    of_a = pose_point(rotation, trees.objects.position[a], kept.on_a)
+    of_b = pose_point(trees.objects.rotation[b], trees.objects.position[b], kept.on_b)
+    n = rotation * kept.normal
     sense = wp.where(pair[0] == a, wp.float64(1.0), wp.float64(-1.0))
-    return wp.float64(0.5) * (of_a + of_b), n, memory.depth[turn, m, k] + sense * wp.dot(of_a - of_b, n)
+    return wp.float64(0.5) * (of_a + of_b), n, kept.depth + sense * wp.dot(of_a - of_b, n)
 
 
 @wp.func
@@ -201,7 +216,7 @@ def recall_points(
     What is known of the pair is copied to the other table.
     """
     turn, found, k = memory.turn[0], wp.int32(0), warp_lane()
-    other, count = 1 - turn, memory.count[turn, m]
+    other, count = 1 - turn, memory.searched[turn, m].count
     while k - warp_lane() < count:
         j = wp.min(k, count - 1)
         point, n, depth = recall_point(trees, batch, p, m, j, memory)
@@ -213,20 +228,12 @@ def recall_points(
             manifolds.depth[p, place] = depth
             manifolds.before[p, place] = memory.shown[turn, m, j]
         if k < count:
-            memory.point_a[other, p, j] = memory.point_a[turn, m, j]
-            memory.point_b[other, p, j] = memory.point_b[turn, m, j]
-            memory.normal[other, p, j] = memory.normal[turn, m, j]
-            memory.depth[other, p, j] = memory.depth[turn, m, j]
+            memory.points[other, p, j] = memory.points[turn, m, j]
             memory.shown[other, p, j] = wp.where(shows, place, -1)
         k += warp_size()
     if warp_lane() == 0:
         manifolds.count[p] = found
-        memory.lods[other, p] = memory.lods[turn, m]
-        memory.gap[other, p] = memory.gap[turn, m]
-        memory.rotation[other, p] = memory.rotation[turn, m]
-        memory.translation[other, p] = memory.translation[turn, m]
-        memory.any_hit[other, p] = memory.any_hit[turn, m]
-        memory.count[other, p] = count
+        memory.searched[other, p] = memory.searched[turn, m]
 
 
 @wp.func
@@ -249,7 +256,7 @@ def match_point(
     turn, nearest, x = memory.turn[0], wp.int32(-1), manifolds.point[p, k]
     reach = MATCH_SHARE * smaller_size(trees, batch.pairs[p][0], batch.pairs[p][1])
     least = reach * reach
-    for j in range(memory.count[turn, m]):
+    for j in range(memory.searched[turn, m].count):
         point, n, _depth = recall_point(trees, batch, p, m, j, memory)
         far = wp.dot(point - x, point - x)
         if memory.shown[turn, m, j] >= 0 and far < least and wp.dot(n, manifolds.normal[p, k]) > MATCH_COSINE:
@@ -288,20 +295,24 @@ def note_points(
     back_a, back_b = wp.transpose(trees.objects.rotation[a]), wp.transpose(trees.objects.rotation[b])
     while k < manifolds.count[p]:
         manifolds.before[p, k] = match_point(p, m, k, trees, batch, memory, manifolds)
-        memory.point_a[other, p, k] = back_a * (manifolds.point[p, k] - trees.objects.position[a])
-        memory.point_b[other, p, k] = back_b * (manifolds.point[p, k] - trees.objects.position[b])
-        memory.normal[other, p, k] = back_a * manifolds.normal[p, k]
-        memory.depth[other, p, k] = manifolds.depth[p, k]
+        kept = KeptPoint()
+        kept.on_a = back_a * (manifolds.point[p, k] - trees.objects.position[a])
+        kept.on_b = back_b * (manifolds.point[p, k] - trees.objects.position[b])
+        kept.normal = back_a * manifolds.normal[p, k]
+        kept.depth = manifolds.depth[p, k]
+        memory.points[other, p, k] = kept
         memory.shown[other, p, k] = k
         k += warp_size()
     if warp_lane() == 0:
+        searched = SearchedPair()
         rotation, translation = relative_pose(trees.objects, a, b)
-        memory.lods[other, p] = lods_of(trees, batch.pairs[p])
-        memory.gap[other, p] = gap
-        memory.rotation[other, p] = rotation
-        memory.translation[other, p] = translation
-        memory.any_hit[other, p] = any_hit
-        memory.count[other, p] = manifolds.count[p]
+        searched.rotation = rotation
+        searched.translation = translation
+        searched.gap = gap
+        searched.lods = lods_of(trees, batch.pairs[p])
+        searched.any_hit = any_hit
+        searched.count = manifolds.count[p]
+        memory.searched[other, p] = searched
 
 
 @wp.kernel

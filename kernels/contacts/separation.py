@@ -23,15 +23,13 @@ from warp_abtree.kernels.exact.double_word import BOUND_DOUBLE, double_orient2d
 from warp_abtree.kernels.exact.predicates import BOUND_2D, drop_axis
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK
 from warp_abtree.kernels.triangle.corners import load_corners, load_triangles
-from warp_abtree.kernels.triangle.distance import divide
+from warp_abtree.kernels.triangle.distance import Triangles, divide, scale_triangles
 from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR, round_area, unit_vector
 from warp_abtree.kernels.triangle.triangle_pair import (
-    Triangles,
     between_features,
     cross_exactly,
     feature_weights,
     nearest_features,
-    scale_triangles,
 )
 
 wp.set_module_options(native.options("base/counters.cuh", "exact/double_word.cuh"))

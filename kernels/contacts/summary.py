@@ -74,18 +74,21 @@ class ChunkSums:
     """Sums over each chunk."""
 
     span: wp.array(dtype=wp.vec3i)  # (pair, first contact, end), shape [chunk]; nothing behind the last pair's
-    length: wp.array(dtype=wp.float64)  # sum of lengths, shape [chunk]
-    point: wp.array(dtype=wp.vec3d)  # weighted, from the pair's first end, shape [chunk]
-    normal: wp.array(dtype=wp.vec3d)  # weighted, shape [chunk]
-    crossed: wp.array(dtype=wp.float64)  # contacts whose faces intersect, shape [chunk]
+    lengths: wp.array(dtype=six_numbers)  # length, and number of contacts whose faces intersect; shape [chunk]
+    means: wp.array(dtype=six_numbers)  # weighted points, from the pair's first end, and normals; shape [chunk]
 
 
 @wp.func
-def two_numbers(x: wp.float64, y: wp.float64):
-    numbers = six_numbers()
-    numbers[0] = x
-    numbers[1] = y
-    return numbers
+def sum_chunks(p: wp.int32, start: wp.array(dtype=wp.int32), numbers: wp.array(dtype=six_numbers)):
+    """Return the sums over the chunks of a pair, by all lanes of a warp."""
+    all = six_numbers()
+    c = first_chunk(p, start)
+    end = end_chunk(p, start)
+    while c < end:
+        k = wp.min(c + warp_lane(), end - 1)
+        all = add_in_order(all, numbers[k], wp.min(end - c, warp_size()))
+        c += warp_size()
+    return all
 
 
 @wp.kernel
@@ -107,21 +110,7 @@ def sum_length_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_
         sums = add_in_order(sums, length, count)
         first += warp_size()
     if warp_lane() == 0:
-        sums_inout.length[c] = sums[0]
-        sums_inout.crossed[c] = sums[1]
-
-
-@wp.func
-def sum_lengths(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
-    """Return the length of all contacts of a pair, or 0, and how many are of faces that intersect."""
-    all = six_numbers()
-    c = first_chunk(p, start)
-    end = end_chunk(p, start)
-    while c < end:
-        k = wp.min(c + warp_lane(), end - 1)
-        all = add_in_order(all, two_numbers(sums.length[k], sums.crossed[k]), wp.min(end - c, warp_size()))
-        c += warp_size()
-    return all[0], all[1]
+        sums_inout.lengths[c] = sums
 
 
 @wp.kernel
@@ -139,7 +128,8 @@ def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_in
     p = span[0]
     origin = contacts.p0[start[p]]
     half = wp.float64(0.5)
-    total, number = sum_lengths(p, start, sums_inout)
+    lengths = sum_chunks(p, start, sums_inout.lengths)
+    total, number = lengths[0], lengths[1]
     sums = six_numbers()
     first = wp.int32(span[1])
     while first < span[2]:
@@ -156,22 +146,7 @@ def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_in
         sums = add_in_order(sums, both, count)
         first += warp_size()
     if warp_lane() == 0:
-        sums_inout.point[c] = wp.vec3d(sums[0], sums[1], sums[2])
-        sums_inout.normal[c] = wp.vec3d(sums[3], sums[4], sums[5])
-
-
-@wp.func
-def sum_means(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
-    """Return a pair's mean point, from its first end, and the sum of its weighted normals."""
-    all = six_numbers()
-    c = first_chunk(p, start)
-    end = end_chunk(p, start)
-    while c < end:
-        k = wp.min(c + warp_lane(), end - 1)
-        x, n = sums.point[k], sums.normal[k]
-        all = add_in_order(all, six_numbers(x[0], x[1], x[2], n[0], n[1], n[2]), wp.min(end - c, warp_size()))
-        c += warp_size()
-    return wp.vec3d(all[0], all[1], all[2]), wp.vec3d(all[3], all[4], all[5])
+        sums_inout.means[c] = sums
 
 
 @wp.func
@@ -200,20 +175,20 @@ def average_contacts_kernel(
 ):
     """Find the mean point and normal of one object pair a warp."""
     p = wp.tid() / warp_size()
-    _, number = sum_lengths(p, start, sums)
-    if number == wp.float64(0.0):
+    lengths = sum_chunks(p, start, sums.lengths)
+    if lengths[1] == wp.float64(0.0):
         if warp_lane() == 0:
             write_no_contacts(p, pair_contacts_out)
         return
-    middle, normals = sum_means(p, start, sums)
+    means = sum_chunks(p, start, sums.means)
     if warp_lane() == 0:
-        pair_contacts_out.normal[p] = mean_normal(trees, batch.pairs[p], normals)
-        pair_contacts_out.point[p] = contacts.p0[start[p]] + middle
+        pair_contacts_out.normal[p] = mean_normal(trees, batch.pairs[p], wp.vec3d(means[3], means[4], means[5]))
+        pair_contacts_out.point[p] = contacts.p0[start[p]] + wp.vec3d(means[0], means[1], means[2])
 
 
 @native.func_native(cpu=True)
 def simd_sum_lengths(contacts: Contacts, ends: wp.vec2i, total: wp.ref[wp.float64], number: wp.ref[wp.float64]):
-    """Find the length of an object pair's contacts, and how many are of faces that intersect, as `sum_lengths`."""
+    """Find the length of an object pair's contacts, and how many are of faces that intersect, as `sum_chunks`."""
 
 
 @native.func_native(cpu=True)
@@ -225,7 +200,7 @@ def simd_sum_means(
     middle: wp.ref[wp.vec3d],
     normal: wp.ref[wp.vec3d],
 ):
-    """Find the mean point of a pair's contacts, from the first end, and the mean of normals, as `sum_means`."""
+    """Find the mean point of a pair's contacts, from the first end, and the mean of normals, as `sum_chunks`."""
 
 
 @wp.kernel

@@ -47,7 +47,6 @@ from warp_abtree.kernels.triangle.distance import (
     POSE_ROUNDING,
     largest_coordinate,
     power_below,
-    skew_of,
 )
 from warp_abtree.kernels.triangle.triangle_pair import PAIR_ROUNDING, triangle_distance
 
@@ -134,7 +133,8 @@ def make_scale(trees: Trees, pose: PairPose, a: wp.int32, b: wp.int32):
     most = wp.max(wp.max(reach_a, reach_b), far)
     scale = wp.min(wp.float64(1.0) / power_below(most), SCALE_MAX)
     one = wp.float64(1.0)
-    skew_a, skew_b = skew_of(trees.objects.rotation[a]), skew_of(trees.objects.rotation[b])
+    skew_a, _ = measure_rotation(trees.objects.rotation[a])
+    skew_b, _ = measure_rotation(trees.objects.rotation[b])
     sizes = (reach_a + largest_coordinate(centre_a)) + (reach_b + largest_coordinate(centre_b))
     sizes = sizes + largest_coordinate(trees.objects.position[b] - trees.objects.position[a])
     scaling = SearchScale()

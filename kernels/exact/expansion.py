@@ -27,20 +27,10 @@ def two_product(a: wp.float64, b: wp.float64):
 
 
 @native.func_native()
-def sum_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.float64: ...
+def expand_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.float64:
+    """Return det(a - d, b - d, c - d) to a few roundings; on CUDA for the first EXPANSION_LANES lanes of a warp."""
 
 
 @native.func_native()
-def sum_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d) -> wp.float64: ...
-
-
-@wp.func(inline=False)
-def expand_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return det(a - d, b - d, c - d) to a few roundings; on CUDA for the first EXPANSION_LANES lanes of a warp."""
-    return sum_volume(a, b, c, d)
-
-
-@wp.func(inline=False)
-def expand_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
+def expand_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d) -> wp.float64:
     """Return det(a - c, b - c) to a few roundings."""
-    return sum_area(a, b, c)

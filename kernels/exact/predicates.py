@@ -13,8 +13,12 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.exact.double_word import BOUND_DOUBLE, double_orient2d, double_orient3d
-from warp_abtree.kernels.exact.exact import exact_orient2d, exact_orient3d
-from warp_abtree.kernels.exact.int128 import integer_orient2d, integer_orient3d
+from warp_abtree.kernels.exact.integers import (
+    exact_orient2d,
+    exact_orient3d,
+    integer_orient2d,
+    integer_orient3d,
+)
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -13,8 +13,8 @@ from warp_abtree.kernels.base.nodes import Node, load_node
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.distance.frame import SearchScale
 from warp_abtree.kernels.inside.parity import STACK_ROOM, load_posed_face
-from warp_abtree.kernels.triangle.distance import clamp_unit, divide
-from warp_abtree.kernels.triangle.triangle_pair import Features, cross_exactly, offer, offer_corner, scale_triangles
+from warp_abtree.kernels.triangle.distance import clamp_unit, divide, scale_triangles
+from warp_abtree.kernels.triangle.triangle_pair import Features, cross_exactly, offer, offer_corner
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

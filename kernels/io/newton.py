@@ -65,6 +65,13 @@ def find_changed_kernel(
 
 
 @wp.func
+def rotation_of(x: wp.transform):
+    """Return the rotation matrix of a pose, its quaternion normalised in float64."""
+    q = wp.transform_get_rotation(x)
+    return rotate_quaternion(wp.vec4d(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3])))
+
+
+@wp.func
 def pose_shape(
     body_q: wp.array(dtype=wp.transform),
     shape_body: wp.array(dtype=wp.int32),
@@ -85,14 +92,11 @@ def pose_object_kernel(
     shape_transform: wp.array(dtype=wp.transform),
     objects_out: ObjectPool,
 ):
-    """Put each object where its shape stands, its quaternion normalised in float64."""
+    """Put each object where its shape stands."""
     i = wp.tid()
     x = pose_shape(body_q, shape_body, shape_transform, shapes[i])
-    q = wp.transform_get_rotation(x)
     objects_out.position[i] = wp.vec3d(wp.transform_get_translation(x))
-    objects_out.rotation[i] = rotate_quaternion(
-        wp.vec4d(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3]))
-    )
+    objects_out.rotation[i] = rotation_of(x)
 
 
 @wp.func
@@ -103,9 +107,7 @@ def enter_body(
     if shape_body[shape] < 0:
         return wp.vec3(point)
     x = body_q[shape_body[shape]]
-    q = wp.transform_get_rotation(x)
-    turned = rotate_quaternion(wp.vec4d(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3])))
-    return wp.vec3(wp.transpose(turned) * (point - wp.vec3d(wp.transform_get_translation(x))))
+    return wp.vec3(wp.transpose(rotation_of(x)) * (point - wp.vec3d(wp.transform_get_translation(x))))
 
 
 @wp.func

@@ -19,7 +19,7 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import Trees, load_vertex
 from warp_abtree.kernels.motion.path import Motion, across, place_motion, reverse_moment
-from warp_abtree.kernels.triangle.distance import corners_type
+from warp_abtree.kernels.triangle.distance import corners_type, scale_triangles
 from warp_abtree.kernels.triangle.float64_filter import float64_filter_triangles
 from warp_abtree.kernels.triangle.triangle_pair import (
     CORNERS_OF_A,
@@ -27,7 +27,6 @@ from warp_abtree.kernels.triangle.triangle_pair import (
     between_features,
     cross_exactly,
     nearest_features,
-    scale_triangles,
 )
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

@@ -6,7 +6,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees, load_vertex
 from warp_abtree.kernels.base.nodes import load_constant
 from warp_abtree.kernels.base.poses import PairPose, pose_point
-from warp_abtree.kernels.triangle.triangle_pair import scale_triangles
+from warp_abtree.kernels.triangle.distance import scale_triangles
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

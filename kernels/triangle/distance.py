@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.nodes import load_node
-from warp_abtree.kernels.base.poses import reach_box, sum_products
+from warp_abtree.kernels.base.poses import measure_rotation, reach_box
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -56,6 +56,42 @@ def divide(a: wp.float64, b: wp.float64):
 @wp.func
 def clamp_unit(x: wp.float64):
     return wp.min(wp.max(x, wp.float64(0.0)), wp.float64(1.0))
+
+
+@wp.struct
+class Triangles:
+    """Two triangles relative to a corner of A, by a power of two."""
+
+    a1: wp.vec3d  # corners of A, the first at the origin
+    a2: wp.vec3d  # the other one
+    b0: wp.vec3d  # corners of B
+    b1: wp.vec3d  # the second
+    b2: wp.vec3d  # the third
+    size: wp.float64  # the power of two
+
+
+@wp.func
+def scale_triangles(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
+    t = Triangles()
+    t.a1 = a1 - a0
+    t.a2 = a2 - a0
+    t.b0 = b0 - a0
+    t.b1 = b1 - a0
+    t.b2 = b2 - a0
+    size = wp.max(
+        wp.max(largest_coordinate(t.a1), largest_coordinate(t.a2)),
+        wp.max(largest_coordinate(t.b0), wp.max(largest_coordinate(t.b1), largest_coordinate(t.b2))),
+    )
+    # 1 where all points are in one place.
+    power = power_below(size)
+    t.size = wp.where(power > wp.float64(0.0), power, wp.float64(1.0))
+    scale = wp.float64(1.0) / t.size
+    t.a1 = t.a1 * scale
+    t.a2 = t.a2 * scale
+    t.b0 = t.b0 * scale
+    t.b1 = t.b1 * scale
+    t.b2 = t.b2 * scale
+    return t
 
 
 @wp.func
@@ -133,37 +169,15 @@ def edges_have_gap(a: corners_type, b: corners_type, d: wp.float64):
 @wp.func
 def triangles_near(d: wp.float64, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
     """Return 0 where two closed triangles are certainly farther apart than d >= 0, else 1."""
-    zero = wp.vec3d()
-    e1 = a1 - a0
-    e2 = a2 - a0
-    f0 = b0 - a0
-    f1 = b1 - a0
-    f2 = b2 - a0
-    size = wp.max(
-        wp.max(largest_coordinate(e1), largest_coordinate(e2)),
-        wp.max(largest_coordinate(f0), wp.max(largest_coordinate(f1), largest_coordinate(f2))),
-    )
-    # Points in one place give 0, hence no number and no proof.
-    scale = wp.float64(1.0) / power_below(size)
-    a = wp.matrix_from_rows(zero, e1 * scale, e2 * scale)
-    b = wp.matrix_from_rows(f0 * scale, f1 * scale, f2 * scale)
-    far = d * scale
+    t = scale_triangles(a0, a1, a2, b0, b1, b2)
+    a = wp.matrix_from_rows(wp.vec3d(), t.a1, t.a2)
+    b = wp.matrix_from_rows(t.b0, t.b1, t.b2)
+    far = d * (wp.float64(1.0) / t.size)
     normal_a = square_up(wp.cross(a[1], a[2]), a[1], a[2])
     normal_b = square_up(wp.cross(b[1] - b[0], b[2] - b[0]), b[1] - b[0], b[2] - b[0])
     if has_gap(normal_a, a, b, far) or has_gap(normal_b, a, b, far) or edges_have_gap(a, b, far):
         return 0
     return 1
-
-
-@wp.func
-def skew_of(r: wp.mat33d):
-    """Return the largest entry of |R^T R - 1|, by which a matrix is off orthonormal."""
-    skew = wp.float64(0.0)
-    for i in range(3):
-        for j in range(3):
-            gram = sum_products(r[0, i], r[0, j], r[1, i], r[1, j], r[2, i], r[2, j])
-            skew = wp.max(skew, wp.abs(gram - wp.where(i == j, wp.float64(1.0), wp.float64(0.0))))
-    return skew
 
 
 @wp.func
@@ -186,8 +200,8 @@ def pad_distance(trees: Trees, a: wp.int32, b: wp.int32, d: wp.float64):
     reach_a = reach_a + largest_coordinate(trees.models.centre[trees.states.model[state_a]])
     reach_b = reach_b + largest_coordinate(trees.models.centre[trees.states.model[state_b]])
     shift = largest_coordinate(trees.objects.position[b] - trees.objects.position[a])
-    skew_a = skew_of(trees.objects.rotation[a])
-    skew_b = skew_of(trees.objects.rotation[b])
+    skew_a, _ = measure_rotation(trees.objects.rotation[a])
+    skew_b, _ = measure_rotation(trees.objects.rotation[b])
     two = wp.float64(2.0)
     padded = d * (wp.float64(1.0) + two * (skew_a + skew_b) + POSE_ROUNDING)
     return padded + wp.float64(6.0) * skew_a * reach_a + POSE_ROUNDING * (reach_a + reach_b + shift)

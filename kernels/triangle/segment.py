@@ -316,28 +316,14 @@ def intersect_faces(scale: wp.float64, corner: wp.array(dtype=wp.vec3d)):
 
 
 @native.func_native()
-def find_normal(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, normal: wp.ref[wp.vec3d]) -> bool: ...
-
-
-@wp.func
-def filter_normal(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """Return `face_normal` without expansions, and whether it is certain."""
-    normal = wp.vec3d()
-    sure = find_normal(a, b, c, normal)
-    return normal, sure
+def find_normal(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, normal: wp.ref[wp.vec3d]) -> bool:
+    """Find `face_normal` without expansions; return whether it is certain."""
 
 
 @native.func_native()
-def find_segment(proven: bool, a: wp.mat33d, b: wp.mat33d, start: wp.ref[wp.vec3d], end: wp.ref[wp.vec3d]) -> bool: ...
-
-
-@wp.func
-def filter_segment(proven: bool, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
-    """Return the ends of `cross_planes` without expansions or arrays, and whether they are certain.
+def find_segment(proven: bool, a: wp.mat33d, b: wp.mat33d, start: wp.ref[wp.vec3d], end: wp.ref[wp.vec3d]) -> bool:
+    """Find the ends of `cross_planes` without expansions or arrays; return whether they are certain.
 
     Args:
         proven: Whether the triangles are known to intersect.
     """
-    start, end = wp.vec3d(), wp.vec3d()
-    sure = find_segment(proven, wp.matrix_from_rows(a0, a1, a2), wp.matrix_from_rows(b0, b1, b2), start, end)
-    return start, end, sure

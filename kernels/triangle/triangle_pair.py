@@ -31,7 +31,7 @@ longer than 4 L.
 import warp as wp
 
 from warp_abtree.kernels.exact.expansion import fuse_multiply
-from warp_abtree.kernels.triangle.distance import clamp_unit, divide, largest_coordinate, power_below
+from warp_abtree.kernels.triangle.distance import Triangles, clamp_unit, divide
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -49,42 +49,6 @@ class Features:
     kind: wp.int32  # candidate
     x: wp.float64  # parameters of both edges, or weights of the face's second and third corner
     y: wp.float64  # the other one
-
-
-@wp.struct
-class Triangles:
-    """Two triangles relative to a corner of A, by a power of two."""
-
-    a1: wp.vec3d  # corners of A, the first at the origin
-    a2: wp.vec3d  # the other one
-    b0: wp.vec3d  # corners of B
-    b1: wp.vec3d  # the second
-    b2: wp.vec3d  # the third
-    size: wp.float64  # the power of two
-
-
-@wp.func
-def scale_triangles(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
-    t = Triangles()
-    t.a1 = a1 - a0
-    t.a2 = a2 - a0
-    t.b0 = b0 - a0
-    t.b1 = b1 - a0
-    t.b2 = b2 - a0
-    size = wp.max(
-        wp.max(largest_coordinate(t.a1), largest_coordinate(t.a2)),
-        wp.max(largest_coordinate(t.b0), wp.max(largest_coordinate(t.b1), largest_coordinate(t.b2))),
-    )
-    # 1 where all points are in one place.
-    power = power_below(size)
-    t.size = wp.where(power > wp.float64(0.0), power, wp.float64(1.0))
-    scale = wp.float64(1.0) / t.size
-    t.a1 = t.a1 * scale
-    t.a2 = t.a2 * scale
-    t.b0 = t.b0 * scale
-    t.b1 = t.b1 * scale
-    t.b2 = t.b2 * scale
-    return t
 
 
 @wp.func

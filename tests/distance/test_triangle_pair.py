@@ -7,7 +7,8 @@ from helpers.questions import launch
 from oracles.triangle import pairs_intersect
 from oracles.triangle_distance import triangle_distance as true_distance
 
-from warp_abtree.kernels.triangle.triangle_pair import PAIR_ROUNDING, feature_weights, nearest_features, scale_triangles
+from warp_abtree.kernels.triangle.distance import scale_triangles
+from warp_abtree.kernels.triangle.triangle_pair import PAIR_ROUNDING, feature_weights, nearest_features
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -10,9 +10,14 @@ from oracles.signs import COUNT, KINDS, random_floats, rounded_signs, true_signs
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.exact.double_word import add_double, double_orient2d, double_orient3d
-from warp_abtree.kernels.exact.exact import exact_orient2d, exact_orient3d, exact_volume
 from warp_abtree.kernels.exact.expansion import EXPANSION_LANES, expand_area, expand_volume, two_product
-from warp_abtree.kernels.exact.int128 import integer_orient2d, integer_orient3d
+from warp_abtree.kernels.exact.integers import (
+    exact_orient2d,
+    exact_orient3d,
+    exact_volume,
+    integer_orient2d,
+    integer_orient3d,
+)
 from warp_abtree.kernels.exact.predicates import UNCERTAIN, orient2d, orient3d, orient_edges
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, gap_signs, plane_signs, side_of_plane
 from warp_abtree.kernels.triangle.signs import SEPARATED, have_one_side

@@ -24,7 +24,7 @@ void bound_firsts(const NearFaces& near, const Covers& covers, const double* cor
         FaceLanes firsts;
         firsts.load(NearFaces::points(over, 0), NearFaces::points(over, 3), NearFaces::points(over, 6));
         for (int k = 0; k < 9; k += 3)
-            found = FaceLanes::higher(found, firsts.distance_sq(NearFaces::points(corner, k)));
+            found = FaceLanes::greater(found, firsts.distance_sq(NearFaces::points(corner, k)));
         *(lanes*)(first_bound + (i - begin)) = has_first ? found : lanes{} + __builtin_inf();
     }
 }

@@ -17,7 +17,10 @@ struct Faces64 : Points64<Number> {
     typedef typename F::lanes lanes;
     typedef typename F::bits bits;
     typedef typename F::Point Point;
+    using F::cross;
     using F::dot;
+    using F::greater;
+    using F::lesser;
     using F::minus;
     Point a, b, c, ab, ac, bc;
     lanes ab_sq, ac_sq, bc_sq, thin;
@@ -26,16 +29,10 @@ struct Faces64 : Points64<Number> {
     bits has_area;
     bool has_sides;
 
-    static Point cross(const Point& u, const Point& v) {
-        return Point{u.y * v.z - u.z * v.y, u.z * v.x - u.x * v.z, u.x * v.y - u.y * v.x};
-    }
     static Point normalize(const Point& v) {
         const lanes size = F::root(dot(v, v));
         return F::choose(size > 0.0, F::divide(v, size), Point{});
     }
-    // As wp.min without its care for NaN.
-    static lanes lower(const lanes& u, const lanes& v) { return u < v ? u : v; }
-    static lanes higher(const lanes& u, const lanes& v) { return u < v ? v : u; }
     void load(const Point& first, const Point& second, const Point& third) {
         a = first;
         b = second;
@@ -52,7 +49,7 @@ struct Faces64 : Points64<Number> {
     // start + along * t is the point of the edge nearest to p.
     static lanes edge_distance_sq(const Point& p, const Point& start, const Point& along, lanes t, const lanes& size) {
         const lanes zero = {}, one = zero + 1.0;
-        t = size > 0.0 ? lower(higher(t / size, zero), one) : zero;
+        t = size > 0.0 ? lesser(one, greater(t / size, zero)) : zero;
         const Point to = minus(p, Point{start.x + along.x * t, start.y + along.y * t, start.z + along.z * t});
         return dot(to, to);
     }
@@ -76,9 +73,9 @@ struct Faces64 : Points64<Number> {
         const bits known = at_a | at_b | at_c | inside;
         if (!are_all(known)) {
             const Point ca = minus(a, c);
-            const lanes edges = lower(
-                edge_distance_sq(p, a, ab, d1, ab_sq),
-                lower(edge_distance_sq(p, b, bc, dot(bp, bc), bc_sq), edge_distance_sq(p, c, ca, dot(cp, ca), ac_sq)));
+            const lanes of_bc = edge_distance_sq(p, b, bc, dot(bp, bc), bc_sq);
+            const lanes of_ca = edge_distance_sq(p, c, ca, dot(cp, ca), ac_sq);
+            const lanes edges = lesser(lesser(of_ca, of_bc), edge_distance_sq(p, a, ab, d1, ab_sq));
             found = inside ? found : edges;
         }
         found = at_c ? dot(cp, cp) : found;

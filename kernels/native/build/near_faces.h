@@ -59,9 +59,9 @@ struct NearFaces {
     static int find_lane(const lanes& found, double value) { return __builtin_ctz(Float64::to_mask(found == value)); }
     // The least of all lanes.
     static double least_of(lanes v) {
-        v = FaceLanes::lower(v, __builtin_shufflevector(v, v, 4, 5, 6, 7, 0, 1, 2, 3));
-        v = FaceLanes::lower(v, __builtin_shufflevector(v, v, 2, 3, 0, 1, 6, 7, 4, 5));
-        v = FaceLanes::lower(v, __builtin_shufflevector(v, v, 1, 0, 3, 2, 5, 4, 7, 6));
+        v = FaceLanes::lesser(__builtin_shufflevector(v, v, 4, 5, 6, 7, 0, 1, 2, 3), v);
+        v = FaceLanes::lesser(__builtin_shufflevector(v, v, 2, 3, 0, 1, 6, 7, 4, 5), v);
+        v = FaceLanes::lesser(__builtin_shufflevector(v, v, 1, 0, 3, 2, 5, 4, 7, 6), v);
         return v[0];
     }
     // As `point_nearest_face`.
@@ -85,7 +85,7 @@ struct NearFaces {
         for (int g = 0; g < groups && bound > limit; ++g) {
             lanes worst = {};
             for (int k = 0; k < p.count; ++k)
-                worst = FaceLanes::higher(worst, *(const lanes*)(p.corner[k].distance + 8 * g));
+                worst = FaceLanes::greater(worst, *(const lanes*)(p.corner[k].distance + 8 * g));
             worst = those_of(worst, g);
             const unsigned int within = Float64::to_mask(worst <= limit);
             const double here = within ? worst[__builtin_ctz(within)] : least_of(worst);

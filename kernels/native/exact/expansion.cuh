@@ -4,7 +4,7 @@
 #include "exact/expansion_sum.h"
 #include "base/sizes.h"
 
-inline CUDA_CALLABLE wp::float64 sum_volume(wp::vec3d a, wp::vec3d b, wp::vec3d c, wp::vec3d d) {
+CALLED wp::float64 expand_volume(wp::vec3d a, wp::vec3d b, wp::vec3d c, wp::vec3d d) {
 #if defined(__CUDA_ARCH__)
     // Of odd length, so that lanes at the same component take different banks.
     __shared__ double rows[EXPANSION_LANES][EXPANSION_LENGTH + 1];
@@ -29,7 +29,7 @@ inline CUDA_CALLABLE wp::float64 sum_volume(wp::vec3d a, wp::vec3d b, wp::vec3d 
     return sum.value();
 }
 
-inline CUDA_CALLABLE wp::float64 sum_area(wp::vec2d a, wp::vec2d b, wp::vec2d c) {
+CALLED wp::float64 expand_area(wp::vec2d a, wp::vec2d b, wp::vec2d c) {
     double row[16];  // products of two: eight of two words, and their zeros
     ExpansionSum sum = {row, 0};
     DoubleWord u[2], v[2];

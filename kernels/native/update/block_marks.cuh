@@ -4,22 +4,20 @@
 #include "base/shared.cuh"
 #include "base/sizes.h"
 
-inline CUDA_CALLABLE wp::uint64 block_marks(wp::array_t<wp::uint32> scratch) {
+template <int WORDS>
+CUDA_CALLABLE wp::uint64 marks_of(wp::array_t<wp::uint32> scratch) {
 #if defined(__CUDA_ARCH__)
-    __shared__ unsigned int words[MARK_WORDS];
+    __shared__ unsigned int words[WORDS];
     return (unsigned int)__cvta_generic_to_shared(words);
 #else
     return (wp::uint64)scratch.data;
 #endif
 }
 
+inline CUDA_CALLABLE wp::uint64 block_marks(wp::array_t<wp::uint32> scratch) { return marks_of<MARK_WORDS>(scratch); }
+
 inline CUDA_CALLABLE wp::uint64 shallow_marks(wp::array_t<wp::uint32> scratch) {
-#if defined(__CUDA_ARCH__)
-    __shared__ unsigned int words[SHALLOW_WORDS];
-    return (unsigned int)__cvta_generic_to_shared(words);
-#else
-    return (wp::uint64)scratch.data;
-#endif
+    return marks_of<SHALLOW_WORDS>(scratch);
 }
 
 inline CUDA_CALLABLE wp::uint32 read_word(wp::uint64 marks, wp::int32 i) {

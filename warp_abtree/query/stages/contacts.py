@@ -58,6 +58,7 @@ import warp as wp
 
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.base.lanes import WARP_SIZE
+from warp_abtree.kernels.base.sums import six_numbers
 from warp_abtree.kernels.contacts import contact, separation, summary
 from warp_abtree.kernels.io import contact_results as pack
 from warp_abtree.kernels.io import sort_hits
@@ -125,8 +126,6 @@ class ContactStage(Stage):
         hits, pairs = rooms.hits, rooms.pairs
         if hits >= 2**30:
             raise CapacityError(f"{hits} face pairs asked, a contact query has room for fewer than 2^30")
-        means = {"point": wp.vec3d, "normal": wp.vec3d}
-        sums = {"span": wp.vec3i, "length": wp.float64, "crossed": wp.float64, **means}
         return [
             Array(self, "faces", wp.vec3i, hits),
             *fields(self.contacts, hits, **dict.fromkeys(VECTORS, wp.vec3d), coplanar=wp.int32),
@@ -135,9 +134,9 @@ class ContactStage(Stage):
             Array(self, "key", wp.int64, 2 * hits),
             Array(self, "order", wp.int32, 2 * hits),
             Array(self, "start", wp.int32, pairs + 1, 0),
-            *fields(self.pair_contacts, pairs, **means),
+            *fields(self.pair_contacts, pairs, point=wp.vec3d, normal=wp.vec3d),
             *([Array(self.contacts, "separation", wp.float64, hits)] if self._with_gap else []),
-            *fields(self._sums, self._chunk_count(hits, pairs), **sums),
+            *fields(self._sums, self._chunk_count(hits, pairs), span=wp.vec3i, lengths=six_numbers, means=six_numbers),
         ]
 
     def link(self):

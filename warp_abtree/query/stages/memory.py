@@ -11,10 +11,8 @@ from warp_abtree.kernels.contacts import memory
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.stage import Array, Rooms, Stage, fields
 
-PAIR_TYPES = {"pairs": wp.vec2i, "lods": wp.vec2i, "gap": wp.float64, "rotation": wp.mat33d, "translation": wp.vec3d}
-PAIR_TYPES |= {"any_hit": wp.int32, "count": wp.int32}
-POINT_TYPES = {"point_a": wp.vec3d, "point_b": wp.vec3d, "normal": wp.vec3d, "depth": wp.float64}
-POINT_TYPES |= {"shown": wp.int32}
+PAIR_TYPES = {"pairs": wp.vec2i, "searched": memory.SearchedPair}
+POINT_TYPES = {"points": memory.KeptPoint, "shown": wp.int32}
 
 
 def check_remember(remember, gap) -> float | None:
