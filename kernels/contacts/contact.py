@@ -87,15 +87,6 @@ def have_crossed(contacts: Contacts, i: wp.int32):
 
 
 @wp.func
-def blend_normals(normal_a: wp.vec3d, normal_b: wp.vec3d):
-    """Return the mean direction from A to B of the normals of two faces, 0 where neither has an area."""
-    normal = normal_a - normal_b
-    if wp.dot(normal, normal) <= SHORTEST_NORMAL * SHORTEST_NORMAL:
-        normal = normal_a
-    return unit_vector(normal)
-
-
-@wp.func
 def write_contact(
     trees: Trees,
     own: PairObjects,
@@ -112,7 +103,10 @@ def write_contact(
     end1 = pose_point(rotation, trees.objects.position[own.a], p1)
     normal_a = unit_vector(rotation * face_normal_a)
     normal_b = unit_vector(rotation * face_normal_b)
-    normal = blend_normals(normal_a, normal_b)
+    normal = normal_a - normal_b
+    if wp.dot(normal, normal) <= SHORTEST_NORMAL * SHORTEST_NORMAL:
+        normal = normal_a
+    normal = unit_vector(normal)
     if wp.dot(normal, normal) == wp.float64(0.0):
         normal = pair_direction(trees, own.a, own.b)
     back = own.swapped != 0

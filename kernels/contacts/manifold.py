@@ -165,15 +165,6 @@ def offer_pair_crossing_kernel(
         slots_inout.used[p] = 1
 
 
-@wp.func
-def write_middle(w: wp.int32, i: wp.int32, contacts: Contacts, witnesses: Witnesses):
-    """Write the middle and an end of contact i as candidates, which have no depth."""
-    for k in range(COLUMN_CORNERS):
-        witnesses.depth[w, k] = wp.where(k < 2, NO_DEPTH, NO_POINT)
-    witnesses.point[w, 0] = wp.float64(0.5) * (contacts.p0[i] + contacts.p1[i])
-    witnesses.point[w, 1] = contacts.p1[i]
-
-
 @wp.kernel(cuda_max_registers=216)
 def find_crossing_kernel(
     trees: Trees,
@@ -205,4 +196,8 @@ def find_crossing_kernel(
     pair, has_area = load_crossing(i, trees, batch, faces[i], contacts), curves.has_area[root] != 0
     loop, shell = curves.loop_normal[root], gap_of(gap, item[0])
     if not find_crossing(trees.objects, pair, loop, has_area, shell, batch.poses[item[0]].scale, w, witnesses_out):
-        write_middle(w, i, contacts, witnesses_out)
+        # The middle and an end are candidates then, which have no depth.
+        for k in range(COLUMN_CORNERS):
+            witnesses_out.depth[w, k] = wp.where(k < 2, NO_DEPTH, NO_POINT)
+        witnesses_out.point[w, 0] = wp.float64(0.5) * (contacts.p0[i] + contacts.p1[i])
+        witnesses_out.point[w, 1] = contacts.p1[i]

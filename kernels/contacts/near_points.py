@@ -19,7 +19,9 @@ from warp_abtree.kernels.contacts.separation import write_near_contact
 from warp_abtree.kernels.contacts.slots import WitnessRows, tree_size
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK, Hits
 
-wp.set_module_options(native.options("base/counters.cuh", "contacts/candidates.cuh", "exact/double_word.cuh"))
+wp.set_module_options(
+    native.options("base/counters.cuh", "contacts/candidates.cuh", "exact/double_word.cuh", "triangle/gap.cuh")
+)
 
 # A face's normal serves where the other face looks against it within 60 degrees.
 OPPOSED_LEAST = wp.constant(wp.float64(0.5))

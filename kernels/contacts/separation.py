@@ -23,16 +23,15 @@ from warp_abtree.kernels.exact.double_word import BOUND_DOUBLE, double_orient2d
 from warp_abtree.kernels.exact.predicates import BOUND_2D, drop_axis
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, PAIR_MASK
 from warp_abtree.kernels.triangle.corners import load_corners, load_triangles
-from warp_abtree.kernels.triangle.distance import Triangles, divide, scale_triangles
+from warp_abtree.kernels.triangle.distance import Triangles, scale_triangles
 from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR, round_area, unit_vector
 from warp_abtree.kernels.triangle.triangle_pair import (
     between_features,
-    cross_exactly,
     feature_weights,
     nearest_features,
 )
 
-wp.set_module_options(native.options("base/counters.cuh", "exact/double_word.cuh"))
+wp.set_module_options(native.options("base/counters.cuh", "exact/double_word.cuh", "triangle/gap.cuh"))
 
 # Separations are no smaller in magnitude, so that their sign says which faces intersect, as float32 too.
 LEAST_SEPARATION = wp.constant(wp.float64(2.0**-126))
@@ -60,85 +59,13 @@ def plain_normal(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     return unit_vector(wp.vec3d(x, y, z))
 
 
-@wp.struct
-class Gap:
-    """Widest gap yet between two triangles, a square that keeps its sign, over the square of a direction's length."""
+@native.func_native()
+def find_depth(t: Triangles, direction: wp.ref[wp.vec3d]) -> wp.float64:
+    """Find the direction from A to B, of any length, that leaves the widest gap; return the depth of triangles.
 
-    square: wp.float64  # below 0 / 0 there is none
-    length: wp.float64  # squared
-    direction: wp.vec3d  # from A to B
-
-
-@wp.func
-def offer_gap(best: wp.ref[Gap], n: wp.vec3d, low: wp.float64, high: wp.float64):
-    """Offer the gap along n, of which B lies from low to high if A is at 0."""
-    gap, length = wp.max(-high, low), wp.dot(n, n)
-    square = gap * wp.abs(gap)
-    if square * best.length > best.square * length:
-        best.square = square
-        best.length = length
-        best.direction = wp.where(low >= -high, n, -n)
-
-
-@wp.func
-def offer_face(best: wp.ref[Gap], n: wp.vec3d, x: wp.vec3d, y: wp.vec3d, z: wp.vec3d):
-    """Offer the gap along n, across a face of A; x, y, z are the other's corners relative to a corner of it."""
-    p, q, r = wp.dot(n, x), wp.dot(n, y), wp.dot(n, z)
-    offer_gap(best, n, wp.min(p, wp.min(q, r)), wp.max(p, wp.max(q, r)))
-
-
-@wp.func
-def offer_edge_gap(best: wp.ref[Gap], n: wp.vec3d, a: wp.float64, b: wp.float64, r: wp.vec3d):
-    """Offer the gap along a vector n across an edge of each face.
-
-    Args:
-        a, b: How far the corners opposite of the edges lie along n from them.
-        r: From the first edge's start to the second's.
+    The depth is the shortest motion that parts triangles which intersect [scaled]. It is never too short but for a few
+    roundings, and too long by at most 2^-26 of the size where edges are nearly parallel.
     """
-    zero = wp.float64(0.0)
-    z = wp.dot(n, r)
-    # A lies from 0 to a, B from z to z + b.
-    low = z + wp.min(b, zero) - wp.max(a, zero)
-    high = z + wp.max(b, zero) - wp.min(a, zero)
-    offer_gap(best, n, low, high)
-
-
-@wp.func
-def widest_gap(t: Triangles):
-    """Return the widest gap that a direction leaves between two triangles: a face's normal, or one across two edges.
-
-    Of triangles that intersect the motion that parts them is never too short but for a few roundings, and too long by
-    at most 2^-26 of the size where edges are nearly parallel, as the direction across them errs then.
-    """
-    best = Gap()
-    best.square = wp.float64(-1.0)
-    e0, e1, e2 = t.a1, t.a2 - t.a1, -t.a2
-    f0, f1, f2 = t.b1 - t.b0, t.b2 - t.b1, t.b0 - t.b2
-    normal_a, normal_b = cross_exactly(t.a1, t.a2), cross_exactly(f0, -f2)
-    offer_face(best, normal_a, t.b0, t.b1, t.b2)
-    # Seen from B, A lies on the other side.
-    offer_face(best, -normal_b, t.b0, t.b0 - t.a1, t.b0 - t.a2)
-    # Along e x f, of an edge e of A, the corner opposite of e lies by -f . normal_a; that of f by e . normal_b.
-    a0, a1, a2 = -wp.dot(f0, normal_a), -wp.dot(f1, normal_a), -wp.dot(f2, normal_a)
-    b0, b1, b2 = wp.dot(e0, normal_b), wp.dot(e1, normal_b), wp.dot(e2, normal_b)
-    offer_edge_gap(best, wp.cross(e0, f0), a0, b0, t.b0)
-    offer_edge_gap(best, wp.cross(e0, f1), a1, b0, t.b1)
-    offer_edge_gap(best, wp.cross(e0, f2), a2, b0, t.b2)
-    offer_edge_gap(best, wp.cross(e1, f0), a0, b1, t.b0 - t.a1)
-    offer_edge_gap(best, wp.cross(e1, f1), a1, b1, t.b1 - t.a1)
-    offer_edge_gap(best, wp.cross(e1, f2), a2, b1, t.b2 - t.a1)
-    offer_edge_gap(best, wp.cross(e2, f0), a0, b2, t.b0 - t.a2)
-    offer_edge_gap(best, wp.cross(e2, f1), a1, b2, t.b1 - t.a2)
-    offer_edge_gap(best, wp.cross(e2, f2), a2, b2, t.b2 - t.a2)
-    return best
-
-
-@wp.func
-def crossing_depth(t: Triangles):
-    """Return the shortest motion that parts two triangles which intersect [scaled], see `widest_gap`."""
-    best = widest_gap(t)
-    # Along one line there is no such direction, and any across it parts them.
-    return wp.sqrt(wp.max(divide(-best.square, best.length), wp.float64(0.0)))
 
 
 @wp.kernel
@@ -181,7 +108,8 @@ def find_separation_kernel(
     p = row[0]
     swapped = batch.poses[p].swapped
     t = load_triangles(trees, batch.poses[p], row[1 + swapped], row[2 - swapped])
-    contacts_inout.separation[i] = -wp.max(crossing_depth(t) * t.size, LEAST_SEPARATION)
+    direction = wp.vec3d()
+    contacts_inout.separation[i] = -wp.max(find_depth(t, direction) * t.size, LEAST_SEPARATION)
 
 
 @wp.func
@@ -202,7 +130,9 @@ def write_near_contact(i: wp.int32, trees: Trees, own: PairObjects, pose: PairPo
     normal_b = unit_vector(rotation * plain_normal(corner[3], corner[4], corner[5]))
     normal = unit_vector(rotation * between_features(t, near))
     if near.square <= CLOSEST:
-        normal = unit_vector(rotation * widest_gap(t).direction)
+        direction = wp.vec3d()
+        find_depth(t, direction)
+        normal = unit_vector(rotation * direction)
         if wp.dot(normal, normal) == wp.float64(0.0):
             normal = pair_direction(trees, own.a, own.b)
     back = own.swapped != 0

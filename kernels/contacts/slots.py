@@ -27,7 +27,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.lanes import next_place, warp_lane, warp_size, warp_sync
 from warp_abtree.kernels.base.nodes import load_node
-from warp_abtree.kernels.base.poses import PairBatch, PairPose
+from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 from warp_abtree.kernels.triangle.distance_bounds import load_points, three_points
 
@@ -139,32 +139,19 @@ def start_slots_kernel(
         slots_out.widths[p] = wp.vec2i(of_a, of_b)
 
 
-@wp.func
-def offer_pair(
-    trees: Trees,
-    pose: PairPose,
-    pair: wp.int32,
-    face_a: wp.int32,
-    face_b: wp.int32,
-    gap: wp.array(dtype=wp.float64),
-    slots: Slots,
-):
-    """Offer a face pair that is apart to the slots of its object pair."""
-    scale = wp.float32(pose.scale)
-    a, b = load_points(trees, pose, pose.translation32 * scale, scale, face_a, face_b)
-    reach, weight, widths = wp.float32(gap[pair] * pose.scale), slots.weight[pair], slots.widths[pair]
-    offer_faces(a, b, reach, weight, slots.directions, widths, face_a, face_b, pair, slots.key)
-    slots.used[pair] = 1
-
-
 @wp.kernel
 def offer_near_kernel(step: wp.int32, trees: Trees, batch: PairBatch, hits: Hits, slots_inout: Slots):
     """Offer the face pairs that are listed as apart to the slots of their object pairs, in a grid-stride loop."""
     i = wp.tid()
     end = wp.int32(wp.min(wp.uint32(hits.apart_total[0]), wp.uint32(hits.apart.shape[0])))
     while i < end:
-        row = hits.apart[i]
-        offer_pair(trees, batch.poses[row[0]], row[0], row[1], row[2], hits.gap, slots_inout)
+        pair, face_a, face_b = hits.apart[i][0], hits.apart[i][1], hits.apart[i][2]
+        pose, slots = batch.poses[pair], slots_inout
+        scale = wp.float32(pose.scale)
+        a, b = load_points(trees, pose, pose.translation32 * scale, scale, face_a, face_b)
+        reach, weight, widths = wp.float32(hits.gap[pair] * pose.scale), slots.weight[pair], slots.widths[pair]
+        offer_faces(a, b, reach, weight, slots.directions, widths, face_a, face_b, pair, slots.key)
+        slots.used[pair] = 1
         i += step
 
 

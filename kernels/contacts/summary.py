@@ -158,12 +158,6 @@ def mean_normal(trees: Trees, pair: wp.vec2i, sum: wp.vec3d):
     return unit_vector(n)
 
 
-@wp.func
-def write_no_contacts(p: wp.int32, pair_contacts: PairContacts):
-    pair_contacts.normal[p] = no_vector()
-    pair_contacts.point[p] = no_vector()
-
-
 @wp.kernel
 def average_contacts_kernel(
     trees: Trees,
@@ -178,7 +172,8 @@ def average_contacts_kernel(
     lengths = sum_chunks(p, start, sums.lengths)
     if lengths[1] == wp.float64(0.0):
         if warp_lane() == 0:
-            write_no_contacts(p, pair_contacts_out)
+            pair_contacts_out.normal[p] = no_vector()
+            pair_contacts_out.point[p] = no_vector()
         return
     means = sum_chunks(p, start, sums.means)
     if warp_lane() == 0:
@@ -217,7 +212,8 @@ def sum_pair_kernel(
     total, number = wp.float64(0.0), wp.float64(0.0)
     simd_sum_lengths(contacts, ends, total, number)
     if number == wp.float64(0.0):
-        write_no_contacts(p, pair_contacts_out)
+        pair_contacts_out.normal[p] = no_vector()
+        pair_contacts_out.point[p] = no_vector()
         return
     middle, normal = wp.vec3d(), wp.vec3d()
     simd_sum_means(contacts, ends, total, number, middle, normal)

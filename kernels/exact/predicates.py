@@ -89,17 +89,6 @@ def filter_rows(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
 
 
 @wp.func
-def filter_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return the sign of `orient3d` or UNCERTAIN, and the sum of magnitudes."""
-    return filter_rows(a - d, b - d, c - d)
-
-
-@wp.func
-def sum_sizes64(v: wp.vec3d):
-    return (wp.abs(v[0]) + wp.abs(v[1])) + wp.abs(v[2])
-
-
-@wp.func
 def plain_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """Return the sign of `orient3d` of a determinant rounded to float32, unguarded."""
     u = a - d
@@ -116,7 +105,7 @@ def orient3d(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d)
     """
     if mode == FLOAT32:
         return plain_orient3d(a, b, c, d)
-    sign, size = filter_orient3d(a, b, c, d)
+    sign, size = filter_rows(a - d, b - d, c - d)
     if mode == EXACT and sign == UNCERTAIN:
         sign = resolve_orient3d(a, b, c, d, size)
     return sign

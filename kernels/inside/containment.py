@@ -22,24 +22,19 @@ FIRST_INSIDE, SECOND_INSIDE = wp.constant(2), wp.constant(3)
 
 
 @wp.func
-def probe_of(trees: Trees, pose: PairPose, of_b: bool, face: wp.int32):
-    """Return the first corner of a face of A, or of B, in A's frame."""
-    c = trees.states.face_corner[wp.where(of_b, pose.corner_b, pose.corner_a) + face]
-    x = load_vertex(trees.models.vertex_pos, c[0])
-    if of_b:
-        x = pose_point(pose.rotation, pose.translation, x)
-    return x
-
-
-@wp.func
 def find_inside(trees: Trees, pose: PairPose, solids: Solids, state: wp.int32, of_b: bool, centre: wp.vec3d):
     """Return the lowest face that represents a component inside the solid A, or B, of the other's state; or NO_FACE."""
     lowest = wp.int32(NO_FACE)
     i = wp.int32(0)
     while i < solids.count[state]:
         face = solids.face[solids.first[state] + i]
-        if face < lowest and is_inside(trees, pose, of_b, centre, probe_of(trees, pose, not of_b, face)):
-            lowest = face
+        if face < lowest:
+            corner = trees.states.face_corner[wp.where(of_b, pose.corner_a, pose.corner_b) + face]
+            x = load_vertex(trees.models.vertex_pos, corner[0])
+            if not of_b:
+                x = pose_point(pose.rotation, pose.translation, x)
+            if is_inside(trees, pose, of_b, centre, x):
+                lowest = face
         i += 1
     return lowest
 

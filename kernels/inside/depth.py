@@ -179,7 +179,10 @@ def deepest_of_both(trees: Trees, solids: Solids, pair: wp.vec2i, room: wp.int32
 
 @wp.func
 def deepest_points(trees: Trees, pose: PairPose, pair: wp.vec2i, best: Deepest):
-    """Return the deepest sample of a pair and the point of the other's surface that is nearest: in A's frame, posed."""
+    """Return the deepest sample of a pair, in A's frame and posed, and the nearest point of the other's surface, posed.
+
+    Then the face of the sample, and that of the nearest point.
+    """
     face = wp.int32(best.item >> wp.int64(33))
     weights = sample_weights(wp.int32((best.item >> wp.int64(30)) & wp.int64(7)))
     nearest = wp.int32(best.item & wp.int64(0x3FFFFFFF))
@@ -195,7 +198,7 @@ def deepest_points(trees: Trees, pose: PairPose, pair: wp.vec2i, best: Deepest):
     ids = trees.states.face_corner[trees.states.face_start[trees.objects.state[inner]] + face]
     sample = blend_corners(trees.models, ids, weights)
     sample = pose_point(trees.objects.rotation[inner], trees.objects.position[inner], sample)
-    return point, sample, foot
+    return point, sample, foot, face, nearest
 
 
 @wp.func
@@ -203,9 +206,7 @@ def report_deepest(
     trees: Trees, pose: PairPose, scaling: SearchScale, pair: wp.vec2i, best: Deepest, p: wp.int32, distances: Distances
 ):
     """Write the deepest sample of a pair, the point of the other's surface that is nearest, and their faces."""
-    _point, sample, foot = deepest_points(trees, pose, pair, best)
-    face = wp.int32(best.item >> wp.int64(33))
-    nearest = wp.int32(best.item & wp.int64(0x3FFFFFFF))
+    _point, sample, foot, face, nearest = deepest_points(trees, pose, pair, best)
     d = best.depth
     slack = slack_of(scaling, d)
     least = wp.max((d - slack) / scaling.stretch, wp.float64(0.0))

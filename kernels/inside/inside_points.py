@@ -42,21 +42,13 @@ def size_of(states: StatePool, solid: Solid):
 
 
 @wp.func
-def known_depth(manifolds: Manifolds, p: wp.int32):
-    """Return the greatest depth of the points of a pair, 0 without."""
-    deepest = wp.float64(0.0)
+def known_points(manifolds: Manifolds, p: wp.int32):
+    """Return the greatest depth of the points of a pair, 0 without, and the sum of their normals."""
+    deepest, way = wp.float64(0.0), wp.vec3d()
     for k in range(manifolds.count[p]):
         deepest = wp.max(deepest, manifolds.depth[p, k])
-    return deepest
-
-
-@wp.func
-def way_of_points(manifolds: Manifolds, p: wp.int32):
-    """Return the sum of the normals of the points of a pair."""
-    way = wp.vec3d()
-    for k in range(manifolds.count[p]):
         way += manifolds.normal[p, k]
-    return way
+    return deepest, way
 
 
 @wp.func
@@ -159,7 +151,7 @@ def add_inside_point_kernel(
     first = make_solid(trees, pose, scaling, False, trees.objects.state[a])
     second = make_solid(trees, pose, scaling, True, trees.objects.state[b])
     size = wp.min(size_of(trees.states, first), size_of(trees.states, second))
-    deep = known_depth(manifolds_inout, p)
+    deep, normals = known_points(manifolds_inout, p)
     if manifolds_inout.count[p] > 0 and deep < DEPTH_STEP * size:
         return
     deep += DEPTH_STEP * size
@@ -168,7 +160,7 @@ def add_inside_point_kernel(
     most = manifolds_inout.point.shape[1]
     sampling.samples = 3
     sampling.radius = SAMPLE_SPACING * size
-    normals = wp.transpose(trees.objects.rotation[a]) * way_of_points(manifolds_inout, p)
+    normals = wp.transpose(trees.objects.rotation[a]) * normals
     sampling.way = way_of_second(trees, pose, first, second, hits.any_hit[p], normals)
     along = order_direction(trees.objects.rotation[a])
     search = DepthSearch()
@@ -184,7 +176,7 @@ def add_inside_point_kernel(
         best = deepest_of_both(trees, solids, batch.pairs[p], room, search)
         searching = best.item != KNOWN
         if searching:
-            point, sample, foot = deepest_points(trees, pose, batch.pairs[p], best)
+            point, sample, foot, _face, _nearest = deepest_points(trees, pose, batch.pairs[p], best)
             if warp_lane() == 0:
                 # The way out of what is inside, of the higher object, or of the lower one turned.
                 normal = unit_vector(wp.where(best.of_b != (pose.swapped != 0), foot - sample, sample - foot))

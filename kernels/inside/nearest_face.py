@@ -14,7 +14,7 @@ from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.distance.frame import SearchScale
 from warp_abtree.kernels.inside.parity import STACK_ROOM, load_posed_face
 from warp_abtree.kernels.triangle.distance import clamp_unit, divide, scale_triangles
-from warp_abtree.kernels.triangle.triangle_pair import Features, cross_exactly, offer, offer_corner
+from warp_abtree.kernels.triangle.triangle_pair import Features, cross_exactly, edge_weights, offer, offer_corner
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -112,15 +112,9 @@ def point_features(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d):
 @wp.func
 def point_weights(near: Features):
     """Return the weights of a face's corners at its nearest point."""
-    one, zero = wp.float64(1.0), wp.float64(0.0)
-    rest = one - near.x
     if near.kind == INSIDE_FACE:
-        return wp.vec3d(rest - near.y, near.x, near.y)
-    if near.kind == 0:
-        return wp.vec3d(rest, near.x, zero)
-    if near.kind == 1:
-        return wp.vec3d(zero, rest, near.x)
-    return wp.vec3d(near.x, zero, rest)
+        return wp.vec3d((wp.float64(1.0) - near.x) - near.y, near.x, near.y)
+    return edge_weights(near.kind, near.x)
 
 
 @wp.func

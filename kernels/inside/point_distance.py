@@ -118,8 +118,7 @@ class PlacedPoint:
     """A point in the frame of an object."""
 
     point: wp.vec3d  # there
-    centre: wp.vec3d  # of the object's model
-    pose: PairPose  # the object as A of a pair
+    pose: PairPose  # where the object lies, as A of a pair
     solid: Solid  # the object
     outside: wp.float64  # square of the distance from the object's box
     far: wp.float64  # no surface of the object is farther
@@ -137,32 +136,23 @@ class LastPoint:
 
 
 @wp.func
-def pose_alone(trees: Trees, o: wp.int32):
-    """Return where the arrays of an object's state lie, as those of A of a pair."""
-    state = trees.objects.state[o]
-    pose = PairPose()
-    pose.node_a = trees.states.node_start[state]
-    pose.corner_a = trees.states.face_start[state]
-    return pose
-
-
-@wp.func
 def place_point(trees: Trees, o: wp.int32, point: wp.vec3d):
     """Return a point of the world in an object's frame, with the rounding of distances there."""
+    state = trees.objects.state[o]
     placed = PlacedPoint()
-    placed.pose = pose_alone(trees, o)
-    placed.centre = trees.models.centre[trees.states.model[trees.objects.state[o]]]
+    placed.pose.node_a = trees.states.node_start[state]
+    placed.pose.corner_a = trees.states.face_start[state]
     placed.point = wp.transpose(trees.objects.rotation[o]) * (point - trees.objects.position[o])
     root = load_node(trees.states, placed.pose.node_a + 1)
     size = wp.length(wp.vec3d(root.upper)) + wp.length(wp.vec3d(root.lower))
     solid = Solid()
     solid.node = placed.pose.node_a
-    solid.centre = placed.centre
-    solid.slack = PAIR_ROUNDING * (size + largest_coordinate(placed.centre) + largest_coordinate(placed.point))
+    solid.centre = trees.models.centre[trees.states.model[state]]
+    solid.slack = PAIR_ROUNDING * (size + largest_coordinate(solid.centre) + largest_coordinate(placed.point))
     solid.margin = wp.float64(2.0) * solid.slack
     solid.grow = BOX_GROW
     placed.solid = solid
-    x = placed.point - placed.centre
+    x = placed.point - solid.centre
     placed.outside = square_outside(root, x)
     corner = wp.vec3d()
     for i in range(3):
@@ -263,7 +253,7 @@ def measure_point_kernel(
                     if meets and asked[place][1] != 0:
                         inside = last.inside
                         if place != last.place or not wp.length(placed.point - last.point) < last.free:
-                            inside = is_inside(trees, placed.pose, False, placed.centre, placed.point)
+                            inside = is_inside(trees, placed.pose, False, placed.solid.centre, placed.point)
                     if meets and (inside or answer.least >= wp.float64(0.0)):
                         hint = wp.where(place == last.place, last.face, NO_NEAREST)
                         most = wp.where(inside, within, answer.least)
@@ -310,7 +300,7 @@ def measure_points_of_warp_kernel(
         meets = is_mine and may_be_nearer(placed, wp.min(answer.least, most))
         inside = bool(False)
         if meets and asked[j][1] != 0:
-            inside = is_inside(trees, placed.pose, False, placed.centre, placed.point)
+            inside = is_inside(trees, placed.pose, False, placed.solid.centre, placed.point)
         asks = meets and (inside or answer.least >= wp.float64(0.0))
         if warp_any(asks):
             limit = wp.where(inside, within, wp.min(answer.least, most))

@@ -8,6 +8,7 @@ A record has no padding, so that its numbers lie at any byte; one thread writes 
 """
 
 import functools
+from typing import Any
 
 import warp as wp
 
@@ -48,12 +49,7 @@ def round_vector(v: wp.vec3d):
 
 
 @wp.func
-def keep_vector(v: wp.vec3d):
-    return v
-
-
-@wp.func
-def keep_number(x: wp.float64):
+def keep(x: Any):
     return x
 
 
@@ -135,7 +131,7 @@ def pair_packer(real: type):
 def contact_copier(real: type):
     """Return the kernel that copies contacts into arrays of their own, real numbers float32 or float64."""
     vector = wp.vec3d if real is wp.float64 else wp.vec3
-    convert = keep_vector if real is wp.float64 else round_vector
+    convert = keep if real is wp.float64 else round_vector
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def copy_contact_kernel(
@@ -172,7 +168,7 @@ def number_copier(real: type):
     def copy_number_kernel(numbers: wp.array(dtype=wp.float64), numbers_out: wp.array(dtype=real)):
         """Copy one number a thread."""
         i = wp.tid()
-        numbers_out[i] = wp.static(keep_number if real is wp.float64 else round_to_float32)(numbers[i])
+        numbers_out[i] = wp.static(keep if real is wp.float64 else round_to_float32)(numbers[i])
 
     return copy_number_kernel
 
@@ -181,7 +177,7 @@ def number_copier(real: type):
 def summary_copier(real: type):
     """Return the kernel that copies summaries into arrays of their own, real numbers float32 or float64."""
     vector = wp.vec3d if real is wp.float64 else wp.vec3
-    convert = keep_vector if real is wp.float64 else round_vector
+    convert = keep if real is wp.float64 else round_vector
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def copy_summary_kernel(

@@ -71,19 +71,6 @@ def rotation_of(x: wp.transform):
     return rotate_quaternion(wp.vec4d(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3])))
 
 
-@wp.func
-def pose_shape(
-    body_q: wp.array(dtype=wp.transform),
-    shape_body: wp.array(dtype=wp.int32),
-    shape_transform: wp.array(dtype=wp.transform),
-    shape: wp.int32,
-):
-    """Return the pose of a shape in the world."""
-    if shape_body[shape] < 0:
-        return shape_transform[shape]
-    return body_q[shape_body[shape]] * shape_transform[shape]
-
-
 @wp.kernel
 def pose_object_kernel(
     shapes: wp.array(dtype=wp.int32),
@@ -94,7 +81,10 @@ def pose_object_kernel(
 ):
     """Put each object where its shape stands."""
     i = wp.tid()
-    x = pose_shape(body_q, shape_body, shape_transform, shapes[i])
+    x = shape_transform[shapes[i]]
+    body = shape_body[shapes[i]]
+    if body >= 0:
+        x = body_q[body] * x
     objects_out.position[i] = wp.vec3d(wp.transform_get_translation(x))
     objects_out.rotation[i] = rotation_of(x)
 

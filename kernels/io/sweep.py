@@ -16,15 +16,6 @@ REFUSED = wp.constant(0)  # first pose that is none, NONE_REFUSED if all are
 UNCERTAIN_COUNT = wp.constant(1)  # face pairs that float32 leaves to the later stages
 
 
-@wp.func
-def refuse_pose(objects: ObjectPool, report: wp.array(dtype=wp.int32), i: wp.int32):
-    """Note the index i of a bad pose, and place its object at NaN, where it meets nothing."""
-    far = wp.float64(wp.nan)
-    objects.position[i + 1] = wp.vec3d(far, far, far)
-    objects.rotation[i + 1] = wp.identity(n=3, dtype=wp.float64)
-    wp.atomic_min(report, REFUSED, i)
-
-
 @cache
 def pose_placer(real, width: int):
     """Return the kernel that sets objects 1, 2, ... from poses, and notes the first row that is none."""
@@ -42,7 +33,11 @@ def pose_placer(real, width: int):
             objects_inout.position[i + 1] = position_of(poses, i)
             objects_inout.rotation[i + 1] = rotation_of(poses, i)
         else:
-            refuse_pose(objects_inout, report_inout, i)
+            # At NaN it meets nothing.
+            far = wp.float64(wp.nan)
+            objects_inout.position[i + 1] = wp.vec3d(far, far, far)
+            objects_inout.rotation[i + 1] = wp.identity(n=3, dtype=wp.float64)
+            wp.atomic_min(report_inout, REFUSED, i)
 
     return place_pose_kernel
 

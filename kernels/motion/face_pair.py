@@ -235,14 +235,6 @@ def plane_step(motion: Motion, base: corners_type, at: corners_type, velocity: c
 
 
 @wp.func
-def meet_at(motion: Motion, t: wp.float64, base: corners_type, mover: corners_type):
-    """Return whether faces certainly intersect at a time, by the coordinates that float64 computes."""
-    m = mover_moment(motion, t)
-    at = map_corners(m.rotation, m.shift, mover)
-    return float64_filter_triangles(base[0], base[1], base[2], at[0], at[1], at[2]) == 1
-
-
-@wp.func
 def advance_once(
     tolerance: wp.float64,
     motion: Motion,
@@ -281,7 +273,10 @@ def advance_once(
     if then <= t:
         return contact
     if step < tolerance:
-        if meet_at(motion, wp.min(t + tolerance, wp.float64(1.0)), base, mover):
+        # Whether the faces certainly intersect there, by the coordinates that float64 computes.
+        soon = mover_moment(motion, wp.min(t + tolerance, wp.float64(1.0)))
+        p = map_corners(soon.rotation, soon.shift, mover)
+        if float64_filter_triangles(base[0], base[1], base[2], p[0], p[1], p[2]) == 1:
             return contact
     contact.time = then
     contact.end = wp.where(then > best, CLEAR, IN_PROGRESS)

@@ -9,11 +9,10 @@ from functools import cache
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import StatePool, Trees
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.counters import add_warp_sum
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.lanes import next_place, warp_any, warp_lane, warp_min, warp_size, warp_sync
-from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import (
     CLEAR,
@@ -162,32 +161,6 @@ def group_policy(kind) -> BestFirstPolicy:
     return BestFirstPolicy(MOTION_MEMORY, given_type, Group, None, expand, advance, advance, turns=True)
 
 
-@wp.func
-def start_group(
-    items: wp.uint64,
-    first: wp.int32,
-    size: wp.int32,
-    count: wp.int32,
-    states: StatePool,
-    pair_poses: wp.array(dtype=PairPose),
-    contacts: FirstContacts,
-):
-    """Put the roots of the object pairs that are open on the empty stack; return their group, and how many."""
-    group = Group()
-    group.first = first
-    end = wp.int32(0)
-    for k in range(4):
-        p = first + k
-        group.time[k] = wp.float64(1.0)
-        if k < size and p < count:
-            if contacts.end[p] == OPEN:
-                if warp_lane() == 0:
-                    write_entry(items, end, first_item(states, pair_poses[p]), wp.float32(contacts.time[p]), k)
-                end += 1
-    warp_sync()
-    return group, end
-
-
 @cache
 def warp_motion_search(kind):
     """Return the kernel of warps for motions of a type: `path.Motion` or `linear.LinearMotion`."""
@@ -210,10 +183,20 @@ def warp_motion_search(kind):
         if first >= count or given.batch.launched[0] == STALE:
             return
         lists = start_lists(motion_stack(), wp.where(room < STACK_LENGTH, room, MOTION_STACK_LENGTH))
-        group, roots = start_group(lists.items, first, size, count, trees.states, given.batch.poses, contacts_inout)
-        if roots == 0:
+        group = Group()
+        group.first = first
+        for k in range(4):
+            p = first + k
+            group.time[k] = wp.float64(1.0)
+            if k < size and p < count:
+                if contacts_inout.end[p] == OPEN:
+                    item = first_item(trees.states, given.batch.poses[p])
+                    if warp_lane() == 0:
+                        write_entry(lists.items, lists.end, item, wp.float32(contacts_inout.time[p]), k)
+                    lists.end += 1
+        warp_sync()
+        if lists.end == 0:
             return
-        lists.end = roots
         search_group(trees, given, group, lists)
         for k in range(4):
             p = first + k

@@ -6,7 +6,7 @@ Source: as `intersect_triangles`. `simd.simd_float64_filter` does the same for 8
 
 import warp as wp
 
-from warp_abtree.kernels.exact.predicates import FILTER, UNCERTAIN, filter_rows, orient_edges, sum_sizes64
+from warp_abtree.kernels.exact.predicates import FILTER, UNCERTAIN, filter_rows, orient_edges
 from warp_abtree.kernels.triangle.intersect import intersect_triangles
 from warp_abtree.kernels.triangle.signs import SEPARATED, is_one_sided, pack_signs, rotate_corners
 
@@ -25,7 +25,7 @@ def side_of(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
 
 @wp.func
 def is_zero(d: wp.vec3d):
-    return sum_sizes64(d) == wp.float64(0.0)
+    return (wp.abs(d[0]) + wp.abs(d[1])) + wp.abs(d[2]) == wp.float64(0.0)
 
 
 @wp.func

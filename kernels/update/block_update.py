@@ -200,14 +200,6 @@ def refit_subtree(own: BlockThread, models: ModelPool, states: StatePool, height
 
 
 @wp.func
-def refit_block_level(own: BlockThread, models: ModelPool, states: StatePool, level: wp.int32):
-    """Refit the inner nodes of a level, one a thread at most."""
-    node = (1 << level) + own.thread
-    if node < 2 << level and models.node_face[models.node_start[states.model[own.state]] + node] < 0:
-        refit_inner(states, own.state, node)
-
-
-@wp.func
 def update_whole(own: BlockThread, models: ModelPool, states: StatePool):
     """Refine every face and refit every node: leaves, then a subtree a thread, then level by level.
 
@@ -223,7 +215,9 @@ def update_whole(own: BlockThread, models: ModelPool, states: StatePool):
     while top > 0:
         block_sync()
         top -= 1
-        refit_block_level(own, models, states, top)
+        node = (1 << top) + own.thread
+        if node < 2 << top and models.node_face[models.node_start[states.model[own.state]] + node] < 0:
+            refit_inner(states, own.state, node)
 
 
 @wp.func

@@ -9,22 +9,13 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-def node_depth(node: wp.int32):
-    """Return the depth of a heap index: the position of its highest bit."""
-    x = node
-    depth = wp.int32(0)
-    while x > 1:
-        x = x >> 1
-        depth += 1
-    return depth
-
-
-@wp.func
 def mark_path(leaf: wp.int32, state: wp.int32, states: StatePool, plan: UpdateLists):
     """Mark a leaf and its ancestors as far as no earlier walk has marked them; return how many there were."""
     node_start = states.node_start[state]
     node = leaf
-    depth = node_depth(node)
+    depth = wp.int32(0)
+    while leaf >> depth > 1:
+        depth += 1
     marked = wp.int32(0)
     while node > 0:
         at = node_start + node

@@ -1,6 +1,7 @@
 // Cover original triangles with the faces about a merge: what `cover_queued` does one face at a time, 8 at a time.
 #pragma once
 #include "builtin.h"
+#include "build/fetch_merge.h"
 #include "build/polygon_cuts.h"
 
 // Bounds by the first face to try of each triangle, 8 triangles at a time.
@@ -26,20 +27,6 @@ void bound_firsts(const NearFaces& near, const Covers& covers, const double* cor
         for (int k = 0; k < 9; k += 3)
             found = FaceLanes::greater(found, firsts.distance_sq(NearFaces::points(corner, k)));
         *(lanes*)(first_bound + (i - begin)) = has_first ? found : lanes{} + __builtin_inf();
-    }
-}
-
-// Bring what triangles on a list are registered with into the cache, one step of all lists of slots at a time.
-inline void fetch_slots(const int* slots, const int* node_of, int* list, int lists) {
-    while (lists > 0) {
-        int kept = 0;
-        for (int k = 0; k < lists; ++k) {
-            const int* slot = slots + SLOT_FIELDS * (wp::int64)list[k];
-            __builtin_prefetch(node_of + 3 * slot[SLOT_FACE]);
-            if (slot[SLOT_SIBLING] >= 0)
-                list[kept++] = slot[SLOT_SIBLING];
-        }
-        lists = kept;
     }
 }
 
@@ -76,7 +63,11 @@ wp::int32 cover_ring(const Replay& replay, const Covers& covers, wp::vec3i merge
     for (int i = begin; i < end; ++i)
         if (first_bound[i - begin] > limit)
             list[lists++] = covers.triangle.data[i];
-    fetch_slots(replay.slot.data, near.node_of, list, lists);
+    // What these are registered with.
+    follow_lists(list, lists, [&](int slot) {
+        __builtin_prefetch(near.node_of + 3 * slot_at(slot)[SLOT_FACE]);
+        return slot_at(slot)[SLOT_SIBLING];
+    });
     for (int i = begin, row = 0; i < end; ++i, ++row) {
         const int t = covers.triangle.data[i];
         int* found = covers.face.data + columns * (wp::int64)row;

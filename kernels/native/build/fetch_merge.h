@@ -3,6 +3,21 @@
 #include "builtin.h"
 #include "base/sizes.h"
 
+// Follow lists of slots one step of all at a time, so that memory is waited for once a step. `follow` takes a slot and
+// returns the next one of its list, or -1.
+template <class Follow>
+void follow_lists(int* list, int lists, const Follow& follow) {
+    while (lists > 0) {
+        int kept = 0;
+        for (int i = 0; i < lists; ++i) {
+            const int next = follow(list[i]);
+            if (next >= 0)
+                list[kept++] = next;
+        }
+        lists = kept;
+    }
+}
+
 // Of the merge after `j` all that lies about it, of a later one its two nodes.
 template <class Replay, class Pairs>
 void fetch_merge(const Replay& replay, const Pairs& merge_pair, wp::int32 merge_count, wp::int32 j) {
@@ -19,8 +34,8 @@ void fetch_merge(const Replay& replay, const Pairs& merge_pair, wp::int32 merge_
     }
     if (j + 1 >= merge_count)
         return;
-    // Both rings, then the lists of slots of all their faces, one step at a time: memory is waited for once a step.
-    int list[NEAR_ROOM], lists = 0, left = head[pair[2 * j + 2]], right = head[pair[2 * j + 3]];
+    // Both rings, then the lists of slots of all their faces.
+    int list[NEAR_ROOM], lists = 0, slot_lists = 0, left = head[pair[2 * j + 2]], right = head[pair[2 * j + 3]];
     while ((left >= 0 || right >= 0) && lists + 2 <= NEAR_ROOM) {
         if (left >= 0) {
             list[lists++] = left / 3;
@@ -35,20 +50,16 @@ void fetch_merge(const Replay& replay, const Pairs& merge_pair, wp::int32 merge_
         const int* node = corner_node + 3 * list[i];
         for (int k = 0; k < 3; ++k)
             __builtin_prefetch(pos + 3 * (wp::int64)(node[k] < 0 ? 0 : node[k]));
-        list[i] = replay.face_slot.data[list[i]];
+        const int slot = replay.face_slot.data[list[i]];
+        if (slot >= 0)
+            list[slot_lists++] = slot;
     }
-    while (lists > 0) {
-        int kept = 0;
-        for (int i = 0; i < lists; ++i) {
-            if (list[i] < 0)
-                continue;
-            const int* slot = slots + SLOT_FIELDS * (wp::int64)list[i];
-            const int t = slot[SLOT_TRIANGLE];
-            __builtin_prefetch(slots + SLOT_FIELDS * (wp::int64)t);
-            __builtin_prefetch(corners + 9 * (wp::int64)t);
-            __builtin_prefetch(corners + 9 * (wp::int64)t + 8);
-            list[kept++] = slot[SLOT_NEXT];
-        }
-        lists = kept;
-    }
+    follow_lists(list, slot_lists, [&](int i) {
+        const int* slot = slots + SLOT_FIELDS * (wp::int64)i;
+        const int t = slot[SLOT_TRIANGLE];
+        __builtin_prefetch(slots + SLOT_FIELDS * (wp::int64)t);
+        __builtin_prefetch(corners + 9 * (wp::int64)t);
+        __builtin_prefetch(corners + 9 * (wp::int64)t + 8);
+        return slot[SLOT_NEXT];
+    });
 }

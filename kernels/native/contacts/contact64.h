@@ -8,26 +8,27 @@
 struct Contact64 : SharedSegment<Lanes64> {
     typedef Float64 F;
 
-    // Without double words where it does not extend: of triangle c and d, with u, v and w their differences, perhaps
-    // all turned round. Adds the lanes that it is not sure of to a mask.
+    // A determinant, in double words where it extends and float64 errs too much. Adds the lanes that it is not sure of
+    // to a mask.
+    template <class Extend>
+    static lanes filter(bool extends, double bound, const Sign& sign, const Extend& extend, bits& unsure) {
+        lanes value = sign.value;
+        bits open = errs(bound, sign);
+        if (__builtin_expect(extends && F::to_mask(open) != 0, 0))
+            round(extend(), BOUND_DOUBLE * sign.size, value, open);
+        unsure |= open;
+        return value;
+    }
+    // Of triangle c and d, with u, v and w their differences, perhaps all turned round.
     static lanes filter_volume(bool extends, const Point (&c)[3], const Point& d, const Point& u, const Point& v,
                                const Point& w, bits& unsure) {
-        Sign x = F::volume(u, v, w);
-        bits open = errs(BOUND_3D, x);
-        if (__builtin_expect(extends && F::to_mask(open) != 0, 0))
-            round(Words::orient3d(c[0], c[1], c[2], d), BOUND_DOUBLE * x.size, x.value, open);
-        unsure |= open;
-        return x.value;
+        auto extend = [&] { return Words::orient3d(c[0], c[1], c[2], d); };
+        return filter(extends, BOUND_3D, F::volume(u, v, w), extend, unsure);
     }
-    // In the same way.
     static lanes filter_area(bool extends, const lanes& ax, const lanes& ay, const lanes& bx, const lanes& by,
                              const lanes& cx, const lanes& cy, bits& unsure) {
-        Sign x = F::area(ax, ay, bx, by, cx, cy);
-        bits open = errs(BOUND_2D, x);
-        if (__builtin_expect(extends && F::to_mask(open) != 0, 0))
-            round(Words::orient2d(ax, ay, bx, by, cx, cy), BOUND_DOUBLE * x.size, x.value, open);
-        unsure |= open;
-        return x.value;
+        auto extend = [&] { return Words::orient2d(ax, ay, bx, by, cx, cy); };
+        return filter(extends, BOUND_2D, F::area(ax, ay, bx, by, cx, cy), extend, unsure);
     }
     static Point filter_normal(bool extends, const Point& a, const Point& b, const Point& c, bits& unsure) {
         return unit_vector(Point{filter_area(extends, a.y, a.z, b.y, b.z, c.y, c.z, unsure),

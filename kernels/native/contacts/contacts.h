@@ -41,7 +41,7 @@ struct ContactFinder {
         faces.load(hit, count, a, b);
         for (int i = 0; i < 3; ++i)
             of_b[i] = F::minus(b[i], a[0]);
-        const Depth64::Scaled t = Depth64::scale(a, of_b);
+        const Gap64::Scaled t = Near64::scale(a, of_b);
         Near64 near;
         near.search(t);
         bits open = near.square <= CLOSEST;
@@ -68,7 +68,8 @@ struct ContactFinder {
             for (int j = 0; j < 3; ++j)
                 d[i][j] = F::minus(b[j], a[i]);
         if (with_gap && !again) {
-            const lanes depth = Depth64::measure(Depth64::scale(a, d[0]));
+            const Gap64::Scaled t = Near64::scale(a, d[0]);
+            const lanes depth = Gap64(t).depth() * t.size;
             for (int k = 0; k < count; ++k)
                 contacts.separation.data[hit[k]] = -(depth[k] < LEAST_SEPARATION ? LEAST_SEPARATION : depth[k]);
         }

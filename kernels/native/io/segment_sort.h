@@ -12,7 +12,7 @@ struct SegmentSort {
         asm volatile("bar.sync %0, %1;" ::"r"(barrier), "r"(threads) : "memory");
 #endif
     }
-    // Put each 32 keys in order: a bitonic network, a key a lane. Source: Batcher 1968, Sorting networks.
+    // Put each 32 keys in order: on CUDA by a bitonic network, a key a lane. Source: Batcher 1968, Sorting networks.
     CUDA_CALLABLE void sort_lanes(const word* from, word* to, int n) const {
 #if defined(__CUDA_ARCH__)
         const int lane = begin & 31;
@@ -31,22 +31,11 @@ struct SegmentSort {
                 to[i] = key;
         }
 #else
-        for (int first = 0; first < n; first += 32) {
-            word key[32], other[32];
-            for (int lane = 0; lane < 32; ++lane)
-                key[lane] = first + lane < n ? from[first + lane] : ~0ull;
-            for (int size = 2; size <= 32; size *= 2) {
-                for (int step = size / 2; step > 0; step /= 2) {
-                    for (int lane = 0; lane < 32; ++lane)
-                        other[lane] = key[lane ^ step];
-                    for (int lane = 0; lane < 32; ++lane) {
-                        const bool keeps_less = ((lane & step) == 0) == ((lane & size) == 0);
-                        key[lane] = (other[lane] < key[lane]) == keeps_less ? other[lane] : key[lane];
-                    }
-                }
-            }
-            for (int lane = 0; lane < 32 && first + lane < n; ++lane)
-                to[first + lane] = key[lane];
+        for (int i = 0; i < n; ++i) {
+            int place = i;
+            for (; place % 32 > 0 && to[place - 1] > from[i]; --place)
+                to[place] = to[place - 1];
+            to[place] = from[i];
         }
 #endif
     }

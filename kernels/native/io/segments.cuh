@@ -61,16 +61,9 @@ inline CUDA_CALLABLE void start_segments(wp::int32 tile, wp::int32 rows, wp::int
     if (pair == 0)
         start.data[0] = 0;
 #else
-    long long whole = 0, place = 0;
-    for (int p = 0; p < pairs; ++p)
-        whole += count.data[p];
-    int tally[SEGMENT_THREADS] = {};
-    for (int p = 0; whole == rows && p < pairs && p < first + SEGMENT_THREADS; ++p)
-        if (p < first)
-            place += count.data[p];
-        else
-            tally[p - first] = (int)count.data[p];
-    for (int i = 0; whole != rows && i < rows; ++i) {
+    // Rows alone, which are what counts say wherever none is missing.
+    int tally[SEGMENT_THREADS] = {}, place = 0;
+    for (int i = 0; i < rows; ++i) {
         const int p = face.data[i][0] & pair_mask;
         place += p < first;
         if (p >= first && p < first + SEGMENT_THREADS)
@@ -79,7 +72,7 @@ inline CUDA_CALLABLE void start_segments(wp::int32 tile, wp::int32 rows, wp::int
     if (first == 0)
         start.data[0] = 0;
     for (int k = 0; k < SEGMENT_THREADS && first + k < pairs; ++k) {
-        start.data[first + k + 1] = (int)place;
+        start.data[first + k + 1] = place;
         place += tally[k];
     }
 #endif
