@@ -34,12 +34,6 @@ def first_chunk(p: wp.int32, start: wp.array(dtype=wp.int32)):
 
 
 @wp.func
-def end_chunk(p: wp.int32, start: wp.array(dtype=wp.int32)):
-    """Return the place after a pair's last chunk."""
-    return first_chunk(p, start) + (start[p + 1] - start[p] + CHUNK - 1) // CHUNK
-
-
-@wp.func
 def chunk_span(p: wp.int32, c: wp.int32, start: wp.array(dtype=wp.int32)):
     """Return (pair, first contact, end) of a chunk from its pair's first on; behind its last, the end is the first."""
     first = start[p] + (c - first_chunk(p, start)) * CHUNK
@@ -83,7 +77,7 @@ def sum_chunks(p: wp.int32, start: wp.array(dtype=wp.int32), numbers: wp.array(d
     """Return the sums over the chunks of a pair, by all lanes of a warp."""
     all = six_numbers()
     c = first_chunk(p, start)
-    end = end_chunk(p, start)
+    end = c + (start[p + 1] - start[p] + CHUNK - 1) // CHUNK
     while c < end:
         k = wp.min(c + warp_lane(), end - 1)
         all = add_in_order(all, numbers[k], wp.min(end - c, warp_size()))

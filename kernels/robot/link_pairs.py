@@ -138,14 +138,6 @@ def append_link_pair(
             distances[slot] = distance
 
 
-@wp.func
-def boxes_meet(lower: wp.vec3, upper: wp.vec3, low: wp.vec3, high: wp.vec3):
-    meet = bool(True)
-    for k in range(3):
-        meet = meet and lower[k] <= high[k] and low[k] <= upper[k]
-    return meet
-
-
 @wp.kernel
 def find_link_pair_kernel(
     mode: wp.int32,
@@ -192,7 +184,10 @@ def find_link_pair_kernel(
                     append_link_pair(first, j, within, batch_inout, distances_out)
         else:
             j = base + second
-            if boxes_meet(least, most, boxes.lower[j], boxes.upper[j]):
+            meet = bool(True)
+            for k in range(3):
+                meet = meet and least[k] <= boxes.upper[j][k] and boxes.lower[j][k] <= most[k]
+            if meet:
                 if hopeless:
                     chunk_inout.near[i] = wp.uint8(1)
                 append_link_pair(first, j, within, batch_inout, distances_out)

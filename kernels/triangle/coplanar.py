@@ -18,29 +18,6 @@ def separates_line(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, inner: wp.vec2d, p:
 
 
 @wp.func(inline=False)
-def overlap_coplanar(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: wp.vec2d, q: wp.vec2d, r: wp.vec2d):
-    """Return whether no edge line separates two closed plane triangles.
-
-    Complete for two triangles, and for a triangle and a segment or a point: every edge of their Minkowski difference
-    is then parallel to an edge of one of them. (A segment as p, q, r has side 0 on its own line, so both sides are
-    asked.)
-    """
-    if (
-        separates_line(mode, a, b, c, p, q, r)
-        or separates_line(mode, b, c, a, p, q, r)
-        or separates_line(mode, c, a, b, p, q, r)
-    ):
-        return False
-    if (
-        separates_line(mode, p, q, r, a, b, c)
-        or separates_line(mode, q, r, p, a, b, c)
-        or separates_line(mode, r, p, q, a, b, c)
-    ):
-        return False
-    return True
-
-
-@wp.func(inline=False)
 def widest_axis(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     """Return the axis along which a triangle projects to about the largest area, -1 where all three are collinear."""
     axis = wp.int32(-1)
@@ -58,18 +35,28 @@ def widest_axis(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     return axis
 
 
-@wp.func
+@wp.func(inline=False)
 def intersect_coplanar(
     mode: wp.int32, axis: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d
 ):
-    return overlap_coplanar(
-        mode,
-        drop_axis(a, axis),
-        drop_axis(b, axis),
-        drop_axis(c, axis),
-        drop_axis(p, axis),
-        drop_axis(q, axis),
-        drop_axis(r, axis),
+    """Return whether two closed triangles in one plane meet: no edge line separates what they project to along an axis.
+
+    Complete for two triangles, and for a triangle and a segment or a point: every edge of their Minkowski difference
+    is then parallel to an edge of one of them. (A segment as p, q, r has side 0 on its own line, so both sides are
+    asked.)
+    """
+    a2, b2, c2 = drop_axis(a, axis), drop_axis(b, axis), drop_axis(c, axis)
+    p2, q2, r2 = drop_axis(p, axis), drop_axis(q, axis), drop_axis(r, axis)
+    if (
+        separates_line(mode, a2, b2, c2, p2, q2, r2)
+        or separates_line(mode, b2, c2, a2, p2, q2, r2)
+        or separates_line(mode, c2, a2, b2, p2, q2, r2)
+    ):
+        return False
+    return not (
+        separates_line(mode, p2, q2, r2, a2, b2, c2)
+        or separates_line(mode, q2, r2, p2, a2, b2, c2)
+        or separates_line(mode, r2, p2, q2, a2, b2, c2)
     )
 
 
@@ -138,24 +125,18 @@ def intersect_segments(mode: wp.int32, p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b:
 
 
 @wp.func(inline=False)
-def intersect_degenerate(
-    mode: wp.int32,
-    axis_a: wp.int32,
-    axis_b: wp.int32,
-    a: wp.vec3d,
-    b: wp.vec3d,
-    c: wp.vec3d,
-    p: wp.vec3d,
-    q: wp.vec3d,
-    r: wp.vec3d,
+def intersect_special(
+    mode: wp.int32, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d
 ):
-    """Return whether two faces meet of which at least one has zero area: `widest_axis` -1."""
-    if axis_a < 0 and axis_b < 0:
-        a_low, a_high = find_ends(a, b, c)
-        b_low, b_high = find_ends(p, q, r)
-        return intersect_segments(mode, a_low, a_high, b_low, b_high)
-    if axis_a < 0:
-        a_low, a_high = find_ends(a, b, c)
-        return intersect_segment_triangle(mode, axis_b, a_low, a_high, p, q, r)
-    b_low, b_high = find_ends(p, q, r)
-    return intersect_segment_triangle(mode, axis_a, b_low, b_high, a, b, c)
+    """Decide faces whose plane is shared, or not defined."""
+    axis_a = widest_axis(mode, a0, a1, a2)
+    axis_b = widest_axis(mode, b0, b1, b2)
+    if axis_a >= 0 and axis_b >= 0:
+        return intersect_coplanar(mode, axis_a, a0, a1, a2, b0, b1, b2)
+    a_low, a_high = find_ends(a0, a1, a2)
+    b_low, b_high = find_ends(b0, b1, b2)
+    if axis_a >= 0:
+        return intersect_segment_triangle(mode, axis_a, b_low, b_high, a0, a1, a2)
+    if axis_b >= 0:
+        return intersect_segment_triangle(mode, axis_b, a_low, a_high, b0, b1, b2)
+    return intersect_segments(mode, a_low, a_high, b_low, b_high)

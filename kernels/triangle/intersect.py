@@ -6,7 +6,7 @@ import warp as wp
 
 from warp_abtree.kernels.base.lanes import lowest_bit
 from warp_abtree.kernels.exact.predicates import EXACT, FILTER, UNCERTAIN, orient3d, orient_edges
-from warp_abtree.kernels.triangle.coplanar import intersect_coplanar, intersect_degenerate, widest_axis
+from warp_abtree.kernels.triangle.coplanar import intersect_special
 from warp_abtree.kernels.triangle.signs import (
     SIGNS_OF_A,
     SIGNS_OF_B,
@@ -18,18 +18,6 @@ from warp_abtree.kernels.triangle.signs import (
 )
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
-
-
-@wp.func(inline=False)
-def intersect_special(
-    mode: wp.int32, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d
-):
-    """Decide faces whose plane is shared, or not defined."""
-    axis_a = widest_axis(mode, a0, a1, a2)
-    axis_b = widest_axis(mode, b0, b1, b2)
-    if axis_a < 0 or axis_b < 0:
-        return intersect_degenerate(mode, axis_a, axis_b, a0, a1, a2, b0, b1, b2)
-    return intersect_coplanar(mode, axis_a, a0, a1, a2, b0, b1, b2)
 
 
 @wp.func

@@ -243,37 +243,25 @@ def update_state(own: BlockThread, models: ModelPool, states: StatePool, slice: 
         plan.marked_count[own.state] = wp.where(slice[1] == WHOLE, whole, marked)
 
 
-@functools.cache
-def block_thread(shallow: bool):
-    """Return the function that makes a `BlockThread`, for trees of SHALLOW_DEPTH or of BLOCK_DEPTH at most."""
-    find_marks = shallow_marks if shallow else block_marks
-
-    @wp.func
-    def make_thread(
-        thread: wp.int32,
-        threads: wp.int32,
-        state: wp.int32,
-        models: ModelPool,
-        states: StatePool,
-        scratch: wp.array(dtype=wp.uint32),
-    ):
-        own = BlockThread()
-        own.thread = thread
-        own.threads = threads
-        own.state = state
-        own.marks = find_marks(scratch)
-        own.face_start = models.face_start[states.model[state]]
-        own.depth = models.depth[states.model[state]]
-        own.twice_start = MARK_START + (2 << own.depth)
-        return own
-
-    return make_thread
+@wp.func
+def make_thread(
+    thread: wp.int32, threads: wp.int32, state: wp.int32, models: ModelPool, states: StatePool, marks: wp.uint64
+):
+    own = BlockThread()
+    own.thread = thread
+    own.threads = threads
+    own.state = state
+    own.marks = marks
+    own.face_start = models.face_start[states.model[state]]
+    own.depth = models.depth[states.model[state]]
+    own.twice_start = MARK_START + (2 << own.depth)
+    return own
 
 
 @functools.cache
 def state_update(shallow: bool):
-    """Return the kernel that brings listed states to their LODs, for trees of a depth as `block_thread` has it."""
-    make_thread = block_thread(shallow)
+    """Return the kernel that brings listed states to their LODs, of trees of SHALLOW_DEPTH or BLOCK_DEPTH at most."""
+    find_marks = shallow_marks if shallow else block_marks
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS | {"block_dim": BLOCK_THREADS}, cuda_max_registers=64)
     def update_state_kernel(
@@ -288,7 +276,8 @@ def state_update(shallow: bool):
         block, thread = wp.tid()
         update = wp.int32(block)
         while update < plan_inout.block_count[0]:
-            own = make_thread(thread, threads, plan_inout.block_state[update], models, states_inout, scratch)
+            state = plan_inout.block_state[update]
+            own = make_thread(thread, threads, state, models, states_inout, find_marks(scratch))
             slice = wp.vec2i(plan_inout.block_start[update], plan_inout.block_length[update])
             update_state(own, models, states_inout, slice, plan_inout)
             update += blocks
@@ -298,8 +287,8 @@ def state_update(shallow: bool):
 
 @functools.cache
 def wanted_update(shallow: bool):
-    """Return the kernel that brings states to LODs wanted, for trees of a depth as `block_thread` has it."""
-    make_thread = block_thread(shallow)
+    """Return the kernel that brings states to LODs wanted, of trees of SHALLOW_DEPTH or BLOCK_DEPTH at most."""
+    find_marks = shallow_marks if shallow else block_marks
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS | {"block_dim": BLOCK_THREADS}, cuda_max_registers=64)
     def update_wanted_kernel(
@@ -322,7 +311,7 @@ def wanted_update(shallow: bool):
         block, thread = wp.tid()
         state = wp.int32(block)
         while state < wanted.shape[0]:
-            own = make_thread(thread, threads, state, models, states_inout, scratch)
+            own = make_thread(thread, threads, state, models, states_inout, find_marks(scratch))
             model = states_inout.model[state]
             old = states_inout.lod[state]
             lod = wp.clamp(wanted[state], 0, models.lod_max[model])
