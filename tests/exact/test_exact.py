@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import refused
 from helpers.questions import QUARTERS, ask, coarse, sort_rows, to_matrix
-from helpers.samples import SHAPES, STILL, contact_poses, random_poses, sample, true_faces
+from helpers.samples import SHAPES, STILL, contact_poses, model_of_faces, random_poses, sample, true_faces
 from helpers.viewer import SCENE
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -51,7 +51,7 @@ def split(name):
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     ab_, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     parts = np.stack([np.stack(t, 1) for t in ((a, ab_, ca), (ab_, b, bc), (ca, bc, c), (bc, ca, ab_))], 1)
-    return ab.Model.from_arrays(parts.reshape(-1, 3), np.arange(12 * len(faces)).reshape(-1, 3), base_faces=10**6)
+    return model_of_faces(parts.reshape(-1, 3, 3), base_faces=10**6)
 
 
 def shuffle(rng, name):
@@ -160,7 +160,7 @@ def test_boxes_that_just_touch_are_never_pruned(device, size, far):
     cases = []
     for k in range(0, 60, 2):
         middle = rng.normal(size=3) * far * size
-        a, b = (ab.Model.from_arrays(corners[k + i] + middle, [[0, 1, 2]]) for i in (0, 1))
+        a, b = (model_of_faces(corners[k + i] + middle) for i in (0, 1))
         pose_b = to_matrix(np.eye(3), (corners[k, 0] + middle) - (corners[k + 1, 0] + middle))
         cases += [(a, None, np.eye(4), b, None, pose_b), (a, None, pose[k], a, None, pose[k])]
     assert check_all(device, cases).sum() > 5

@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 from conftest import slow
 from helpers.questions import GpuQuery, launch, pairs_of, scene_of, to_matrix
-from helpers.samples import random_quaternions, true_faces
+from helpers.samples import mirrored, model_of_faces, random_quaternions, true_faces
 from oracles.signs import true_signs
 from oracles.triangle import into_frame_of_a, quaternion_matrix, triangles_intersect
 
@@ -26,7 +26,6 @@ wp.set_module_options(native.options("triangle/float32_filter.cuh"))
 
 U = 2.0**-24
 STILL = np.eye(4)
-FACE = [[0, 1, 2]]
 
 
 def step_ulps(point, axis, sign, steps):
@@ -88,7 +87,7 @@ def test_faces_that_touch_are_never_missed(device, regime, speck_first):
     cases = [touching_pair(rng, *REGIMES[regime], speck_first) for _ in range(80)]
     for a, pose_a, b, pose_b in cases:
         assert triangles_intersect(a, into_frame_of_a(b, pose_a, pose_b))
-    models = [[ab.Model.from_arrays(corners, FACE) for corners in (a, b)] for a, _, b, _ in cases]
+    models = [(model_of_faces(a), model_of_faces(b)) for a, _, b, _ in cases]
     scene = scene_of(device, [(a, None, STILL, b, None, STILL) for a, b in models])
     poses = np.array([pose for case in cases for pose in case[1::2]])
     objects = scene.batch().objects.pool  # past the scene's check, as they may be skewed
@@ -96,13 +95,6 @@ def test_faces_that_touch_are_never_missed(device, regime, speck_first):
     objects.position.assign(np.ascontiguousarray(poses[:, :3, 3]))
     for make_query in (ab.Query, GpuQuery):
         assert make_query(scene, "any", pairs=pairs_of(cases)).run().any.all()
-
-
-def mirrored(corners):
-    """Return a model of a face and its mirror image in the origin, which is the model's centre to the bit."""
-    model = ab.Model.from_arrays(np.concatenate([corners, -corners]), [[0, 1, 2], [3, 4, 5]])
-    assert not model.centre.any()
-    return model
 
 
 # Quaternion of B; lower and upper ends of the boxes of A's and B's face, float32; which end is that of the corner in
@@ -224,9 +216,7 @@ def test_margins_have_what_roundings_add_up_to(device):
         turn = quaternion_matrix(random_quaternions(rng, 1)[0])
         apart = size.max() * rng.normal(size=3) * (k % 3)
         shift = centre_a - turn @ centre_b + apart
-        a, b = (
-            ab.Model.from_arrays(c + s * rng.uniform(-1, 1, (3, 3)), FACE) for c, s in zip((centre_a, centre_b), size)
-        )
+        a, b = (model_of_faces(c + s * rng.uniform(-1, 1, (3, 3))) for c, s in zip((centre_a, centre_b), size))
         cases.append((a, None, STILL, b, None, to_matrix(turn, shift)))
         reach_a, reach_b = (np.abs(m.mesh_at(m.lod_max)[0] - m.centre).max() for m in (a, b))
         at_b, whole = np.abs(b.centre).max(), (np.abs(shift) + np.abs(a.centre)).max()

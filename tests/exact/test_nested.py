@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 from helpers.nested import nested_cases
 from helpers.questions import pairs_of, scene_of, to_matrix
-from helpers.samples import STILL, random_poses, sample, true_faces
+from helpers.samples import model_of_faces, random_poses, sample, true_faces
+from helpers.scenes import scene_with
 
 import warp_abtree as ab
 from warp_abtree import testing
@@ -54,18 +56,8 @@ def test_nested_parts_equal_brute_force(device, gap):
 
 def test_many_subtrees_share_little_memory(monkeypatch):
     """A tree of more subtrees than there is room for; the thread fills slots anew."""
-    rng = np.random.default_rng(2)
-    model = sample("torus")
-    vertices, faces, _ = model.mesh_at(model.lod_max)
-    for _ in range(2):
-        corners = vertices[faces]
-        middle = np.arange(len(faces))[:, None] + len(vertices)
-        vertices = np.concatenate([vertices, corners.mean(1) + 0.01 * rng.normal(size=(len(faces), 3))])
-        faces = np.concatenate([np.column_stack([faces[:, k], faces[:, (k + 1) % 3], middle]) for k in range(3)])
-    fine = ab.Model.from_arrays(vertices, faces)
-    scene = ab.Scene(CPU)
-    for pose in (STILL, (0.01, 0.02, 0, 0, 0, 0.01, 1)):
-        scene.add(fine, pose)
+    fine = ab.Model.load(trimesh.creation.torus(1.0, 0.35, 96, 60))
+    scene = scene_with(CPU, fine, (fine, (0.01, 0.02, 0, 0, 0, 0.01, 1)))
     with testing.regime(plain_tests=10**9):
         expected = ab.Query(scene, "faces", pairs=[(0, 1)]).run()
     with testing.regime(plain_tests=0):
@@ -98,10 +90,9 @@ def test_slabs_that_stay_are_those_of_the_lod():
 
 def test_slabs_serve_several_pairs_in_a_row():
     """Where hits are too frequent for a pair alone: from the second pair of an object on, in every launch alike."""
-    rng = np.random.default_rng(7)
-    scene, model = ab.Scene(CPU), sample("torus")
-    scene.add(model)
-    pairs = [(0, scene.add(model, pose)) for pose in random_poses(rng, 8, 0.5)]
+    model = sample("torus")
+    scene = scene_with(CPU, model, *[(model, pose) for pose in random_poses(np.random.default_rng(7), 8, 0.5)])
+    pairs = [(0, k) for k in range(1, 9)]
     found = {}
     for plain_tests, threads in ((10**9, 1), (10**4, 1), (10**4, 2)):
         with testing.regime(plain_tests=plain_tests, cpu_threads=threads):
@@ -117,11 +108,11 @@ def test_slabs_serve_several_pairs_in_a_row():
 
 def test_slabs_that_stay_fit_an_object_of_any_size():
     """A far larger object leaves directions no meaning, those of the smaller one's slabs too."""
-    model, scene = sample("torus"), ab.Scene(CPU)
-    near = scene.add(model), scene.add(model, (0.01, 0.02, 0, 0, 0, 0, 1))
     wide = 2.0**24 * np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0], [-1, -1, 1], [1, -1, 1], [0, 1, 1]])
-    walls = ab.Model.from_arrays(wide, [[0, 1, 2], [3, 4, 5]])
-    pairs = [near, *((near[0], scene.add(walls, (0, 0, z, 0, 0, 0, 1))) for z in np.linspace(-0.3, 0.3, 7))]
+    walls, model = model_of_faces(wide), sample("torus")
+    placed = [(walls, (0, 0, z, 0, 0, 0, 1)) for z in np.linspace(-0.3, 0.3, 7)]
+    scene = scene_with(CPU, model, (model, (0.01, 0.02, 0, 0, 0, 0, 1)), *placed)
+    pairs = [(0, k) for k in range(1, 9)]
     found = []
     for plain_tests in (0, 10**9):
         with testing.regime(plain_tests=plain_tests, cpu_threads=1):
@@ -160,11 +151,8 @@ def touching_soups(rng, count, reach):
     corner = np.round(rng.uniform(-1, 1, (count, 1, 3)) * 2**10) / 2**10
     small = np.concatenate([corner, corner + np.round(rng.uniform(-1, 1, (count, 2, 3)) * 2**10) / 2**12], 1)
     large = np.concatenate([corner, np.round(reach * rng.uniform(-1, 1, (count, 2, 3)))], 1)
-    scene = ab.Scene(CPU)
     turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # moves no number, so that corners are shared
-    for points, matrix in ((small, np.eye(3)), (large @ turn, turn)):
-        model = ab.Model.from_arrays(points.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
-        scene.add(model, to_matrix(matrix, 0))
+    scene = scene_with(CPU, model_of_faces(small), (model_of_faces(large @ turn), to_matrix(turn, 0)))
     query = ab.Query(scene, "faces", pairs=[(0, 1)])
     rows = query.run().faces[:, 1:]
     assert (rows[rows[:, 0] == rows[:, 1], 0] == np.arange(count)).all()

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import warp as wp
 from helpers.questions import GpuQuery, to_matrix
-from helpers.samples import random_quaternions, sample
+from helpers.samples import model_of_faces, random_quaternions, sample
+from helpers.scenes import scene_with
 from oracles.triangle import into_frame_of_a, quaternion_matrix
 
-import warp_abtree as ab
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import SLAB_DEPTH, PairBatch
@@ -21,10 +21,7 @@ wp.set_module_options(native.options())
 
 def read_slabs(device, model):
     """Return directions, sums and sizes of a model's nodes that have slabs, and the first of these nodes."""
-    scene = ab.Scene(device)
-    for _ in range(2):
-        scene.add(model)
-    query = GpuQuery(scene, "any", pairs=[(0, 1)])
+    query = GpuQuery(scene_with(device, model, model), "any", pairs=[(0, 1)])
     records = query.batch.models.pool.node_slab.numpy()
     low, high = records[:, 0].view(np.int32), records[:, 1].view(np.int32)
     directions = np.stack([low & 0xFFFF, (low >> 16) & 0xFFFF, high], 1) - int(DIRECTION_LENGTH)
@@ -78,18 +75,15 @@ def touching_soups(device, rng, count, reach_a, reach_b, gap=0.0):
     """
     first = rng.uniform(-1, 1, (count, 1, 3))
     turn = quaternion_matrix(random_quaternions(rng, 1)[0])
-    pose, faces = to_matrix(turn, rng.normal(size=3)), np.arange(3 * count).reshape(-1, 3)
+    pose = to_matrix(turn, rng.normal(size=3))
     meet = into_frame_of_a(first.reshape(-1, 3), np.eye(4), pose).reshape(-1, 1, 3)
     plane, along = rng.normal(size=(count, 2, 3)), rng.uniform(-1, 1, (2, count, 2, 2))
     a = np.concatenate([meet, meet + reach_a * (along[0] @ plane)], 1)
     normal = np.cross(plane[:, :1], plane[:, 1:])
     first = first + gap * (normal / np.linalg.norm(normal, axis=2, keepdims=True)) @ turn
     b = np.concatenate([first, first + reach_b * (along[1] @ plane @ turn)], 1)
-    models = [ab.Model.from_arrays(points.reshape(-1, 3), faces) for points in (a, b)]
-    scene = ab.Scene(device)
-    for model, placed in zip(models, (np.eye(4), pose)):
-        scene.add(model, placed)
-    query = GpuQuery(scene, "faces", pairs=[(0, 1)])
+    models = [model_of_faces(points) for points in (a, b)]
+    query = GpuQuery(scene_with(device, models[0], (models[1], pose)), "faces", pairs=[(0, 1)])
     rows = query.run().faces[:, 1:]
     assert gap > 0 or (rows[rows[:, 0] == rows[:, 1], 0] == np.arange(count)).all()
     return query, [model.tree for model in models]

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import warp as wp
 from helpers.questions import ask, launch
-from helpers.samples import random_quaternions
+from helpers.samples import model_of_faces, random_quaternions
+from helpers.scenes import scene_with
 
-import warp_abtree as ab
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.boxes import boxes_overlap, pose_box
@@ -22,7 +22,6 @@ from warp_abtree.kernels.triangle.distance import triangles_near
 
 wp.set_module_options(native.options())
 
-FACE = [[0, 1, 2]]
 SKEW = 2.0**-22  # scenes refuse a frame that is off by 10^-6
 
 
@@ -82,7 +81,7 @@ def turn_of(quaternion):
 
 def is_apart(device, faces, poses, distances):
     """Return which pairs of single faces, of A and of B, are proved farther apart than their distances."""
-    models = [[ab.Model.from_arrays(face, FACE) for face in of_one] for of_one in faces]
+    models = [list(map(model_of_faces, of_one)) for of_one in faces]
     nones = [None] * len(distances)
     cases = list(zip(models[0], nones, poses[0], models[1], nones, poses[1], strict=True))
     return ask(device, cases, output="any", within=distances).apart
@@ -155,9 +154,7 @@ def leaves_kernel(within: wp.float64, trees: Trees, out: wp.array[int]):
 def test_widened_boxes_allow_for_frames_off_orthonormal(device):
     """Corners of A at (1, 1, 1) and (-1, -1, -1), B about the middle: sqrt(3) along a column that is longer than 1."""
     spread = 2.0**-20 * np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
-    scene = ab.Scene(device)
-    scene.add(ab.Model.from_arrays(np.concatenate([1 - spread, spread - 1]), [[0, 1, 2], [3, 4, 5]]))
-    scene.add(ab.Model.from_arrays(spread - 2.0**-21, FACE))
+    scene = scene_with(device, model_of_faces([1 - spread, spread - 1]), model_of_faces(spread - 2.0**-21))
     trees = scene.batch().trees
     third, across = np.ones(3) / np.sqrt(3.0), np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0)
     turn = np.stack([third, across, np.cross(third, across)], 1) * (1 + 2.0**-12)

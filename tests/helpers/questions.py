@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import warp as wp
+from oracles.distance import mesh_distance
 
 import warp_abtree as ab
 from helpers.samples import SHAPES, contact_poses, sample
@@ -124,6 +125,12 @@ def far_cases(rng, far):
         pose_b[:3] += 3 * rng.normal(size=3)
         cases.append((*a, pose_a + shift, *b, pose_b + shift))
     return cases
+
+
+def true_distances(scene, cases):
+    """Return the distance of each pair by brute force, 0 where they intersect."""
+    met = scene.intersect(pairs_of(cases)).any
+    return np.array([0.0 if hit else mesh_distance(*case) for hit, case in zip(met, cases, strict=True)])
 
 
 def to_bytes(result, names=("distance", "bracket", "points", "point_faces")):

@@ -99,6 +99,25 @@ def sample(name, base_faces=4):
     return ab.Model.from_arrays(np.ldexp(mesh.vertices, -exponent), mesh.faces, base_faces=base_faces, name=name)
 
 
+def model_of_faces(corners, **options):
+    """Return the model of faces (f, 3, 3), or of one (3, 3), each with corners of its own."""
+    points = np.reshape(corners, (-1, 3))
+    return ab.Model.from_arrays(points, np.arange(len(points)).reshape(-1, 3), **options)
+
+
+def mirrored(face):
+    """Return the model of a face (3, 3) and its mirror image in the origin, which is the model's centre to the bit."""
+    model = model_of_faces([face, -face])
+    assert not model.centre.any()
+    return model
+
+
+def corners_of(model, lod=None):
+    """Return the corners (f, 3, 3) of a model's faces at a LOD, the finest unless told."""
+    vertices, faces, _ = model.mesh_at(model.lod_max if lod is None else lod)
+    return vertices[faces]
+
+
 @cache
 def plain(model):
     """Return a model's progressive mesh as the lists that the oracle reads."""

@@ -255,7 +255,6 @@ def test_results_have_a_length_and_no_truth_value(device, on_device):
 
 
 MODELS = ("torus", "small ball", "box", "crumbs", "soup", "twins")
-COUNTERS = ("node_tests", "triangle_tests", "exact_tests")
 PAIRS = np.array([(i, j) for i in range(18) for j in range(18) if i != j] + [(0, 18), (18, 3)])
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 from helpers import refused
-from helpers.questions import captured, far_cases, in_a_row, pairs_of, parted_cases, scene_of
+from helpers.questions import captured, far_cases, in_a_row, pairs_of, parted_cases, scene_of, true_distances
 from helpers.samples import STILL, contact_poses, sample
-from oracles.distance import mesh_distance
 
 import warp_abtree as ab
 from warp_abtree import testing
@@ -27,17 +26,11 @@ def check_distances(scene, pairs, distances, close=1e-9):
         assert not scene.intersect(pairs, within=factor * distances).apart.any()
 
 
-def distances_of(scene, cases):
-    """Distance of each pair, 0 where they intersect."""
-    met = scene.intersect(pairs_of(cases)).any
-    return np.array([0.0 if hit else mesh_distance(*case) for hit, case in zip(met, cases, strict=True)])
-
-
 def test_equals_brute_force(device):
     rng = np.random.default_rng(1)
     cases = parted_cases(rng, [tuple(rng.choice(NAMES, 2)) for _ in range(90)], least=1.0)
     scene = scene_of(device, cases)
-    distances = distances_of(scene, cases)
+    distances = true_distances(scene, cases)
     assert 30 < (distances > 0).sum() < 85
     check_distances(scene, pairs_of(cases), distances)
     check_distances(scene, pairs_of(cases)[:, ::-1], distances)
@@ -71,7 +64,7 @@ def test_single_faces_equal_brute_force(device, kind):
         a, b = (ab.Model.from_arrays(corners, [(0, 1, 2)]) for corners in (a, b))
         cases.append((a, 0, STILL, b, 0, STILL))
     scene = scene_of(device, cases)
-    distances = distances_of(scene, cases)
+    distances = true_distances(scene, cases)
     assert (distances > 0).sum() > 24
     check_distances(scene, pairs_of(cases), distances)
 
@@ -101,7 +94,7 @@ def test_far_from_the_origin(device, far):
     """Both objects far away; a mesh with coordinates far from its own origin. What is lost is in proportion."""
     cases = far_cases(np.random.default_rng(6), far)
     scene = scene_of(device, cases)
-    distances = distances_of(scene, cases)
+    distances = true_distances(scene, cases)
     clear = distances > 0.01
     assert clear.sum() > 5
     check_distances(scene, pairs_of(cases)[clear], distances[clear], 1e-9 + 1e-11 * far)
