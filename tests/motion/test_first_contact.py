@@ -7,7 +7,7 @@ import pytest
 from helpers import refused
 from helpers.motions import ANSWERS, STILL, find, random_motions, starts_of, to_bytes
 from helpers.questions import captured, in_a_row, pairs_of, scene_of
-from helpers.samples import random_poses, sample
+from helpers.samples import model_of_faces, random_poses, sample
 from helpers.scenes import scene_with
 from oracles.motion import pose_between, translation_contact
 from scipy.spatial.transform import Rotation
@@ -48,7 +48,7 @@ def test_never_late_and_early_by_the_tolerance(device, tolerance):
 
 
 def random_soup(rng, count, size):
-    """Return corners of faces on a grid of 2^-10, in general position."""
+    """Return corners (f, 3, 3) of faces on a grid of 2^-10, in general position."""
     return np.round(rng.normal(size=(count, 1, 3)) * 300 + rng.normal(size=(count, 3, 3)) * size) / 1024
 
 
@@ -62,7 +62,7 @@ def test_translations_against_fractions(device, far):
         way, off = (np.round(1024 * rng.normal(size=3)) / 1024 for _ in range(2))
         start, end = off - far * way, off + 2 * far * way
         still, pose = STILL, np.concatenate([start, STILL[3:]])
-        models = [ab.Model.from_arrays(s.reshape(-1, 3), np.arange(12).reshape(-1, 3), base_faces=4) for s in (a, b)]
+        models = [model_of_faces(soup, base_faces=4) for soup in (a, b)]
         cases.append([models[0], models[0].lod_max, still, models[1], models[1].lod_max, pose])
         ends += [still, np.concatenate([end, STILL[3:]])]
         truths.append(translation_contact(a, b + start, end - start))
@@ -288,10 +288,7 @@ def test_patches_on_a_screw_are_never_late(device, drift, seed):
     """Also where they drift across the axis."""
     cases, ends = sliding_motions(np.random.default_rng(seed), drift)
     result = find(device, cases, ends)
-    scene, pairs = scene_of(device, cases), pairs_of(cases)
-    starts = starts_of(cases)
+    scene = scene_of(device, cases)
     assert not result.undecided.any() and 10 < result.clear.sum() < COUNT - 10
     for part in np.linspace(0, 1, TIMES):
-        times = np.repeat(part * result.time, 2)
-        scene.set_poses(np.array([pose_between(*row) for row in zip(starts, ends, times)]))
-        assert not scene.intersect(pairs).any[result.time > 0].any(), part
+        assert not meets(scene, cases, ends, part * result.time)[result.time > 0].any(), part

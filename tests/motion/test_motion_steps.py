@@ -8,11 +8,10 @@ import pytest
 import warp as wp
 from helpers.motions import STILL, find
 from helpers.questions import launch, pairs_of, scene_of
-from helpers.samples import random_quaternions
+from helpers.samples import corners_of, model_of_faces, random_quaternions
 from oracles.motion import translation_contact
 from oracles.triangle import quaternion_matrix
 
-import warp_abtree as ab
 from warp_abtree.kernels.motion.face_pair import bend_of_face, safe_step, step_along, time_after
 from warp_abtree.kernels.motion.linear import straight_step
 from warp_abtree.kernels.motion.node_pair import later, step_of
@@ -142,8 +141,7 @@ def test_contacts_are_not_late_where_float64_rounds_much(device, far, size, line
     for k in range(24):
         a, b = (size * (rng.normal(size=(1, 1, 3)) + rng.normal(size=(2, 3, 3))) for _ in range(2))
         off = far * rng.normal(size=(2, 3)) * (k % 2)
-        placed = [(s + x).reshape(-1, 3) for s, x in zip((a, b), off)]
-        models = [ab.Model.from_arrays(points, np.arange(6).reshape(-1, 3), base_faces=2) for points in placed]
+        models = [model_of_faces(soup + x, base_faces=2) for soup, x in zip((a, b), off)]
         still, start = np.array(STILL), np.array(STILL)
         still[:3] = far * rng.normal(size=3) - off[0]
         way = size * rng.normal(size=3)
@@ -152,7 +150,7 @@ def test_contacts_are_not_late_where_float64_rounds_much(device, far, size, line
         end[:3] += 6 * way
         cases.append([models[0], models[0].lod_max, still, models[1], models[1].lod_max, start])
         ends += [still, end]
-        corners = [model.mesh_at(model.lod_max)[0][model.mesh_at(model.lod_max)[1]] for model in models]
+        corners = [corners_of(model) for model in models]
         truths.append(contact_in_fractions(corners, still[:3], start[:3], end[:3]))
     result = find(device, cases, np.array(ends), tolerance=2.0**-40, linear=linear)
     met = scene_of(device, cases).intersect(pairs_of(cases)).any

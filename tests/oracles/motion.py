@@ -4,24 +4,15 @@ import itertools
 from fractions import Fraction
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from oracles.triangle import cross, dot, quaternion_matrix, sub
 
 
-def turn_between(q0, q1, t):
-    """Return the quaternion at a part of the shortest turn."""
-    q0, q1 = q0 / np.linalg.norm(q0), q1 / np.linalg.norm(q1)
-    cosine = q0 @ q1
-    q1, cosine = (-q1, -cosine) if cosine < 0 else (q1, cosine)
-    angle = np.arctan2(np.linalg.norm(q1 - cosine * q0), cosine)
-    if angle == 0:
-        return q0
-    return (np.sin((1 - t) * angle) * q0 + np.sin(t * angle) * q1) / np.sin(angle)
-
-
 def pose_between(start, end, t):
     """Return the pose (7,) at a time: the origin on a straight line, the shortest turn."""
-    return np.concatenate([(1 - t) * start[:3] + t * end[:3], turn_between(start[3:], end[3:], t)])
+    turn = Slerp([0, 1], Rotation.from_quat([start[3:], end[3:]]))(t)
+    return np.concatenate([(1 - t) * start[:3] + t * end[:3], turn.as_quat()])
 
 
 def posed(vertices, pose):
