@@ -13,6 +13,7 @@ from helpers.viewer import write_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.inside import winding_number
+from oracles.triangle import cross, dot
 
 import warp_abtree as ab
 from warp_abtree.app import SceneError, load_scene
@@ -108,25 +109,35 @@ def test_turned_parts_touch_as_near_as_they_round(name):
         np.testing.assert_array_equal(mended.faces, expected.faces)
 
 
-def changed_faces(vertices, faces):
-    """Return which faces of a mesh are turned when it is mended."""
+WALL, BALL_IN = box(9), ball(1, (4, 4, 4))
+ROUNDED = np.where(box(1)[0] == 0, -1e-15, box(1)[0]), box(1)[1]
+# An open box around a box around a ball, and an open sheet in its cavity.
+OPEN = (WALL[0], WALL[1][:-1]), box(5, (2, 2, 2)), BALL_IN, (CORNERS + 3, np.array([(0, 1, 2)]))
+FIN = np.array([*WALL[0][WALL[1][0][:2]], (20, 20, 20)]), np.array([(0, 1, 2)])
+# Parts, and the one that is turned.
+HELD = {
+    "a wall that is out by a rounding is a wall": ((box(3), ROUNDED), 1),
+    "open parts stay and hold nothing": (OPEN, 2),
+    "open parts, all inside out": ([(vertices, faces[:, ::-1]) for vertices, faces in OPEN], 1),
+    "a wall": ((WALL, BALL_IN), 1),
+    "a wall listed twice holds nothing": ((WALL, WALL, BALL_IN), None),
+    "a wall listed three times": ((WALL, WALL, WALL, BALL_IN), 3),
+    "a fin leaves an edge odd of a box that is closed all the same": ((WALL, BALL_IN, FIN), 1),
+}
+
+
+@pytest.mark.parametrize("name", HELD)
+def test_parts_that_closed_ones_hold_are_turned(name):
+    parts, wrong = HELD[name]
+    vertices, faces, part = joined(*parts)
     mesh = mesh_from_arrays(vertices, faces)
-    return (orient_mesh(mesh).faces != mesh.faces).any(1)
-
-
-def test_a_wall_that_is_out_by_a_rounding_is_a_wall():
-    vertices, faces, part = joined(box(3), box(1))
-    vertices[8:][vertices[8:] == 0] = -1e-15
-    np.testing.assert_array_equal(changed_faces(vertices, faces), part == 1)
+    np.testing.assert_array_equal((orient_mesh(mesh).faces != mesh.faces).any(1), part == wrong)
 
 
 def volume(vertices, faces):
     """Return six times the volume within a surface, exactly."""
-    total = Fraction(0)
-    for a, b, c in vertices[faces].tolist():
-        (ax, ay, az), (bx, by, bz), (cx, cy, cz) = ([Fraction(x) for x in corner] for corner in (a, b, c))
-        total += ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
-    return total
+    corners = [[[Fraction(x) for x in corner] for corner in face] for face in vertices[faces].tolist()]
+    return sum(dot(a, cross(b, c)) for a, b, c in corners)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -153,29 +164,6 @@ def test_parts_that_cross_are_bodies_of_their_own():
         for flip in (np.zeros(len(part), bool), last):
             mended = orient_mesh(mesh_from_arrays(mesh.vertices, turned(mesh.faces, flip)))
             assert (volume(mended.vertices, mended.faces[last]) > 0) == (len(parts) == 2)
-
-
-def test_open_parts_stay_and_hold_nothing():
-    """An open box around a ball, and an open sheet in its cavity, go with the majority of their faces alone."""
-    vertices, faces = box(9)
-    parts = joined((vertices, faces[:-1]), box(5, (2, 2, 2)), ball(1, (4, 4, 4)), (CORNERS + 3, np.array([(0, 1, 2)])))
-    for faces, wrong in ((parts[1], 2), (parts[1][:, ::-1], 1)):
-        np.testing.assert_array_equal(changed_faces(parts[0], faces), parts[2] == wrong)
-
-
-def test_walls_listed_several_times_count_as_often():
-    ball_in, wall = ball(1, (4, 4, 4)), box(9)
-    for count in (1, 2, 3):
-        vertices, faces, part = joined(*[wall] * count, ball_in)
-        np.testing.assert_array_equal(changed_faces(vertices, faces), (part == count) & (count % 2 == 1))
-
-
-def test_closed_parts_with_a_fin_hold_what_is_in_them():
-    """A fin leaves its edge odd: the box that it grows on is closed all the same."""
-    vertices, faces = box(9)
-    fin = np.array([*vertices[faces[0][:2]], (20, 20, 20)]), np.array([(0, 1, 2)])
-    vertices, faces, part = joined((vertices, faces), ball(1, (4, 4, 4)), fin)
-    np.testing.assert_array_equal(changed_faces(vertices, faces), part == 1)
 
 
 TORUS = trimesh.creation.torus(1, 0.3, major_sections=12, minor_sections=8)
@@ -209,24 +197,19 @@ def test_edges_are_counted_as_by_hand(faces, vertex_count):
 
 @pytest.mark.parametrize("scale", [1.0, 2.0**-90, 2.0**90])
 def test_closed_meshes_that_are_inside_out_are_found(scale):
+    flat = trimesh.creation.icosphere(1)
     for mesh in (TORUS, trimesh.creation.box(), trimesh.creation.icosphere(2)):
         vertices = mesh.vertices * scale
         assert winding_of(vertices, mesh.faces).fault() is None
         assert winding_of(vertices, mesh.faces[:, ::-1]).fault() == "it is inside out"
     # A volume that vanishes has no sign, however it rounds: two sides of one sheet.
-    flat = (trimesh.creation.icosphere(1).vertices * [1, 1, 0] + [0.1, 0.2, 0.3]) * scale
-    assert winding_of(flat, trimesh.creation.icosphere(1).faces).fault() is None
-
-
-def test_volumes_that_nearly_vanish_have_the_exact_sign():
-    """A slab of one unit in the last place, far from the origin, at an angle."""
+    assert winding_of((flat.vertices * [1, 1, 0] + [0.1, 0.2, 0.3]) * scale, flat.faces).fault() is None
+    # One that nearly vanishes has the exact one: a slab of one unit in the last place.
     box = trimesh.creation.box()
-    for direction in (1, -1):
-        vertices = box.vertices.copy()
-        vertices[:, 2] = 1.0
-        top = box.vertices[:, 2] > 0
-        vertices[top, 2] = np.nextafter(1.0, 2.0 if direction > 0 else 0.0)
-        assert (winding_of(vertices, box.faces).fault() is None) == (direction > 0)
+    for end in (2.0, 0.0):
+        heights = np.where(box.vertices[:, 2] > 0, np.nextafter(1.0, end), 1.0)
+        slab = np.column_stack([box.vertices[:, :2], heights]) * scale
+        assert (winding_of(slab, box.faces).fault() is None) == (end == 2.0)
 
 
 def test_open_and_one_sided_parts():
@@ -237,9 +220,8 @@ def test_open_and_one_sided_parts():
     chosen[:5] = True
     mended = orient_mesh(mesh_from_arrays(grid.vertices, turned(grid.faces[keep], chosen)))
     assert winding_of(mended.vertices, mended.faces).mixed_edges == 0
-    middle = mended.vertices[mended.faces]
-    normals = np.cross(middle[:, 1] - middle[:, 0], middle[:, 2] - middle[:, 0])
-    assert (np.einsum("ij,ij->i", normals, middle.mean(1)) > 0).all()
+    corners = mended.vertices[mended.faces]
+    assert (np.einsum("ij,ij->i", trimesh.triangles.cross(corners), corners.mean(1)) > 0).all()
     n = 9
     angle = 2 * np.pi * np.arange(n) / n
     along, up = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1), np.array([0, 0, 1.0])

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 import warp as wp
 from helpers.questions import launch
-from helpers.samples import random_poses
+from helpers.samples import corners_of, model_of_faces, random_poses
 from helpers.scenes import scene_with
 from helpers.solids import ask, lattice_pose, model_of, moved, shell, voxel_mesh
 from hypothesis import given, settings
@@ -24,7 +24,7 @@ BALL = ab.Model.load(trimesh.creation.icosphere(2, 0.5))
 TORUS = ab.Model.load(trimesh.creation.torus(1, 0.3, major_sections=24, minor_sections=12))
 TINY = ab.Model.load(trimesh.creation.icosphere(1, 0.1), base_faces=4)
 SHELL = model_of(voxel_mesh(shell(5)), "shell")
-SHEET = ab.Model.from_arrays([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], name="sheet")
+SHEET = model_of_faces([[0, 0, 0], [1, 0, 0], [0, 1, 0]], name="sheet")
 
 
 @wp.kernel
@@ -253,7 +253,7 @@ def test_real_meshes_against_winding_numbers(device, name, real_mesh_path):
     poses = random_poses(rng, 150, 1.0)
     poses[:, :3] = rng.uniform(lower, upper, (len(poses), 3))
     for lod in (mesh.lod_max, mesh.lod_for(fraction=0.05)):
-        faces = mesh.mesh_at(lod)[0][mesh.mesh_at(lod)[1]]
+        faces = corners_of(mesh, lod)
         plain = ab.sweep(mesh, probe, poses, lod_a=lod, device=device)
         asked = {"lod_a": lod, "device": device, "solid": (True, False)}
         found = ab.sweep(mesh, probe, poses, **asked)

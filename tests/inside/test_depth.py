@@ -9,7 +9,7 @@ import warp as wp
 from helpers import refused
 from helpers.bodies import about
 from helpers.questions import captured
-from helpers.samples import random_poses
+from helpers.samples import corners_of, model_of_faces, random_poses
 from helpers.scenes import scene_with
 from helpers.solids import ask, lattice_pose, model_of, moved, shell, voxel_mesh
 from oracles.distance import brute_distances
@@ -137,8 +137,8 @@ def test_lattice_bodies(device):
         models = [model_of((vertices * (1, 0.5)[k], faces)) for k, (vertices, faces) in enumerate(bodies)]
         found = ask(device, list(zip(models, poses, (True, True))), **DEPTH)
         if found.any[0]:
-            meshes = [model.mesh_at(model.lod_max)[:2] for model in models]
-            own, other = meshes[0][0][meshes[0][1]], into_frame_of_a(meshes[1][0], *poses)[meshes[1][1]]
+            own = corners_of(models[0])
+            other = into_frame_of_a(corners_of(models[1]).reshape(-1, 3), *poses).reshape(-1, 3, 3)
             expected = max(greatest_depth(samples(own), other), greatest_depth(samples(other), own))
             assert -found.distance[0] == pytest.approx(expected, abs=1e-12)
             deep += expected > 0
@@ -196,15 +196,11 @@ def test_depths_of_surfaces_in_sweeps_are_refused(device, count):
 
 
 def test_depths_after_the_broad_phase_found_surfaces_alone(device):
-    scene, sheet = ab.Scene(device), ab.Model.from_arrays([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    scene.add(BOX, solid=True)
-    for model, x in ((BALL, 20), (sheet, 40), (sheet, 40.01)):
-        scene.add(model, (x, 0, 0, 0, 0, 0, 1))
+    sheet = model_of_faces([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    scene = scene_with(device, (BOX, {"solid": True}), (BALL, moved(20)), (sheet, moved(40)), (sheet, moved(40.01)))
     apart = scene.intersect(None, "distance", signed=True)
     assert apart.pairs.tolist() == [[2, 3]] and apart.distance[0] == 0
-    poses = np.tile((0.0, 0, 0, 0, 0, 0, 1), (4, 1))
-    poses[2:, 0] = 40
-    scene.set_poses(poses)
+    scene.set_poses([moved(), moved(), moved(40), moved(40)])
     expected = ab.DistanceQuery(scene, [(0, 1)], signed=True).run().distance
     assert scene.intersect([(0, 1)], "distance", signed=True).distance == expected < 0
 
@@ -222,8 +218,7 @@ def points_of(device, placed, solid=True, **options):
 
 def triangles_of(model, pose):
     """Return the corners of the faces in the world, (n, 3, 3)."""
-    vertices, faces, _ = model.mesh_at(model.lod_max)
-    return posed(vertices, np.asarray(pose))[faces]
+    return posed(corners_of(model), np.asarray(pose))
 
 
 def depth_in(point, triangles):

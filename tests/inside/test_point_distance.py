@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 from helpers import refused
-from helpers.samples import sample
+from helpers.samples import corners_of, model_of_faces, sample
 from helpers.solids import model_of, shell, turned, voxel_mesh
 from oracles.distance import brute_distances, exact_distance_sq
 from oracles.inside import parity
@@ -66,15 +66,14 @@ def test_sides_are_exact(device, kind):
         vertices, faces = voxel_mesh(cells, rng)
         model = model_of((vertices, turned(faces, rng.random(len(faces)) < 0.5) if kind == "turned" else faces))
         lod = model.lod_max
-    vertices, faces, _ = model.mesh_at(lod)
-    corners = vertices[faces]
-    low, high = vertices.min(0), vertices.max(0)
+    corners = corners_of(model, lod)
+    low, high = corners.min((0, 1)), corners.max((0, 1))
     size = (high - low).max()
     middles = np.floor(rng.uniform(low - 1, high + 1, (60, 3))) + rng.choice([0.5, 0.25, 0.0], (60, 3))
     wall = corners[rng.integers(0, len(corners), 60)].mean(1)
     wall += rng.normal(size=wall.shape) * size * 10.0 ** rng.uniform(-13, -3, (60, 1))
     points = np.concatenate([middles, wall, rng.uniform(low - 0.1 * size, high + 0.1 * size, (60, 3))])
-    points = points[brute_distances(points, corners) > 1e-13 * size][:: 1 + len(faces) // 300]
+    points = points[brute_distances(points, corners) > 1e-13 * size][:: 1 + len(corners) // 300]
     truth = np.array([parity(point, corners) for point in points])
     assert truth.any() and not truth.all()
     found = ab.signed_distance(model, points, lod, device)
@@ -102,23 +101,17 @@ def test_points_do_not_see_one_another(device, monkeypatch):
 def test_warps_and_threads_have_the_same_bits(device, within):
     """Of a model at two LODs, and of a scene with solids and open objects, far from some of them."""
     rng, model = np.random.default_rng(5), sample("torus")
-    vertices, faces, _ = model.mesh_at(model.lod_max)
-    points = np.concatenate([rng.uniform(-1.5, 1.5, (400, 3)), points_about(rng, vertices[faces], 30)])
+    points = np.concatenate([rng.uniform(-1.5, 1.5, (400, 3)), points_about(rng, corners_of(model), 30)])
     scene = ab.Scene(device)
     for k in range(5):
         scene.add(sample("small ball"), pose=(0.7 * k - 1.2, 0.1 * k, 0, 0, 0, 0, 1), solid=k % 2 == 0)
-    flat, middle = (
-        ab.Model.from_arrays(np.float64([[0, 0, 0], [3, 0, 0], [0, 3, 0]]), np.int32([[0, 1, 2]])),
-        [[1.0, 1, 0]],
-    )
+    flat, middle = model_of_faces([[0, 0, 0], [3, 0, 0], [0, 3, 0]]), [[1.0, 1, 0]]
     answers = []
     for warps in (True, False):
         with testing.regime(warps=warps):
             assert ab.signed_distance(flat, middle, device=device, signed=False) == 0.0
-            found = [
-                ab.signed_distance(model, points, lod, device, nearest=True, within=within)
-                for lod in (model.lod_max, model.lod_max // 4)
-            ]
+            lods = model.lod_max, model.lod_max // 4
+            found = [ab.signed_distance(model, points, lod, device, nearest=True, within=within) for lod in lods]
             found.append(scene.signed_distance(points, nearest=True, within=within))
             answers.append([part.tobytes() for one in found for part in one])
     assert answers[0] == answers[1]
@@ -137,7 +130,7 @@ def check_within(whole, part, within):
 @pytest.mark.parametrize("within", [0.0, 0.03, 0.2])
 def test_distances_end_at_a_bound(device, within):
     rng, model = np.random.default_rng(4), sample("torus")
-    corners = model.mesh_at(model.lod_max)[0][model.mesh_at(model.lod_max)[1]]
+    corners = corners_of(model)
     points = np.concatenate([rng.uniform(-1.2, 1.2, (400, 3)), corners[:9, 0]])
     for signed in (True, False):
         whole, part = (
@@ -169,11 +162,10 @@ def test_scene_has_the_least_distance_of_its_objects(device):
     truth = np.full((len(points), scene.object_count), np.inf)
     for i in (0, 1, 2, 3, 6, 7, 8):
         model, pose = scene.models[scene.object_model[i]], scene.poses[i]
-        vertices, faces, _ = model.mesh_at(int(scene.lods[i]))
-        turn = quaternion_matrix(pose[3:])
-        truth[:, i] = brute_distances(points, (vertices @ turn.T + pose[:3])[faces])
+        corners, turn = corners_of(model, int(scene.lods[i])), quaternion_matrix(pose[3:])
+        truth[:, i] = brute_distances(points, corners @ turn.T + pose[:3])
         if scene.object_solid[i]:
-            inside = [parity(point, vertices[faces]) for point in (points - pose[:3]) @ turn]
+            inside = [parity(point, corners) for point in (points - pose[:3]) @ turn]
             truth[:, i] *= np.where(inside, -1, 1)
     found = scene.signed_distance(points, nearest=True)
     least = truth.min(1)
