@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from helpers import refused
 from hypothesis import example, given
+from oracles.inside import components
 
 from warp_abtree.model.files.found import Remarks
 from warp_abtree.model.files.obj import read_obj
@@ -73,11 +74,7 @@ def test_random_soups(soup):
     assert report["closed"] == all(edges.count(edge) % 2 == 0 for edge in set(edges))
     assert report["nonmanifold_edges"] == sum(edges.count(edge) > 2 for edge in set(edges))
     assert report["duplicate_faces"] == len(kept) - len({frozenset(face) for face in kept})
-    groups = []
-    for face in kept:
-        joined = [group for group in groups if group & set(face)]
-        groups = [group for group in groups if group not in joined] + [set(face).union(*joined)]
-    assert report["components"] == len(groups)
+    assert report["components"] == len(components(kept))
     bounds = [mesh.vertices.min(0), mesh.vertices.max(0)]
     assert np.array_equal(report["bounds"], bounds) and np.array_equal(report["extents"], bounds[1] - bounds[0])
     assert report["diagonal"] == pytest.approx(np.linalg.norm(report["extents"]))
@@ -144,9 +141,6 @@ def test_limits_are_included_and_integral_floats_pass():
     assert mesh_from_arrays(np.array(V, np.int8), np.array(F, np.uint8)).faces.tolist() == F
 
 
-STL = b"solid\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
-
-
 def ball():
     """Return an icosphere whose coordinates float32 holds, so that every format can keep them."""
     shape = trimesh.creation.icosphere(subdivisions=2)
@@ -208,37 +202,6 @@ def test_obj_keeps_the_order_of_the_file(tmp_path):
     expected = [[0, 1, 2], [0, 2, 3], [0, 1, 2], [2, 1, 0], [4, 5, 6], [4, 5, 7]]
     np.testing.assert_array_equal(mesh.faces, expected)
     np.testing.assert_array_equal(mesh.vertices[[2, 7]], [[1, 1, 0], [5, 5, 6]])
-
-
-CORNER_LINES = b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"
-
-
-@pytest.mark.parametrize(
-    "file, data, message",
-    [
-        ("a.obj", CORNER_LINES, "no faces"),
-        ("a.obj", b"v 0 0 0\nv 1 0 x\n", "line 2 cannot be read"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nf 1 2\n", "line 3 cannot be read"),
-        ("a.obj", b"v 0 0 0\nf 1 2 -2\n", "line 2 refers to a vertex before the first"),
-        ("a.obj", b"f 1 2 3\n", "no vertices"),
-        ("a.obj", CORNER_LINES.replace(b"1 0 0", b"nan 0 0") + b"f 1 2 3\n", "vertex 1 is not finite"),
-        ("a.obj.gz", b"not gzip at all", "cannot be read"),
-        ("a.obj.gz", gzip.compress(OBJ.encode(), mtime=0)[:-20], "cannot be read"),
-        ("a.stl", b"solid x\nfacet\nendsolid", "no faces"),
-        ("a.stl", STL + b"vertex x 0 0\nvertex 1 0 0\nvertex 0 1 0\n\nendsolid", "cannot be read as stl"),
-        ("a.ply", b"not a ply", "cannot be read as ply"),
-        ("a.docx", b"", "unknown extension 'docx'; known here: .*obj"),
-        ("a.xyz", b"0 0 0\n1 1 1\n", "no faces .*PointCloud"),
-        ("nowhere.obj", None, r"nowhere\.obj: no such file"),
-        ("", None, "is a folder"),
-    ],
-)
-def test_file_errors(tmp_path, file, data, message):
-    path = tmp_path / file
-    if data is not None:
-        path.write_bytes(data)
-    caught = refused(MeshError, message, load_mesh, path)
-    assert str(caught).startswith(f"{path}: ")
 
 
 def test_source_errors(monkeypatch):

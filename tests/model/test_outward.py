@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from conftest import real_mesh_path, slow
 from helpers import refused
-from helpers.samples import crumbs, grid, line, of_trimesh, sample, soup
+from helpers.samples import corners_of, crumbs, grid, line, of_trimesh, sample, soup
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oracles.distance import brute_distances, exact_distance_sq, farthest_distance, lattice_points
@@ -34,16 +34,6 @@ def square_comb(teeth):
 def turned(vertices, faces, seed=0):
     turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
     return vertices @ turn.T, faces
-
-
-def corners_at(model, lod):
-    vertices, faces, _ = model.mesh_at(lod)
-    return vertices[faces]
-
-
-def original(model):
-    """Corners of the faces of the original, those of zero area too."""
-    return corners_at(model, model.lod_max)
 
 
 def some_lods(model, count=6):
@@ -78,8 +68,8 @@ def models(draw):
 @given(models(), st.floats(0, 1))
 def test_no_point_is_farther(model, share):
     lod = int(share * model.lod_max)
-    centre = original(model)[0, 0]  # differences from it are exact or nearly so
-    corners, points = original(model) - centre, lattice_points(corners_at(model, lod) - centre, 9)
+    centre = corners_of(model)[0, 0]  # differences from it are exact or nearly so
+    corners, points = corners_of(model) - centre, lattice_points(corners_of(model, lod) - centre, 9)
     bound = model.error_at(lod, side="outward") + 1e-15 * np.abs(points).max()  # points are rounded
     distance = brute_distances(points, corners)
     # Float64 cannot tell whether a point lies in a sliver; fractions can.
@@ -102,10 +92,10 @@ def test_rounding_is_covered(name):
     """Distances in fractions of points that are themselves fractions: the bound holds without any allowance."""
     model = ab.Model.from_arrays(*EXACT[name](), base_faces=1)
     weights = [(4, 0, 0), (0, 4, 0), (0, 0, 4), (2, 1, 1), (2, 2, 0), (0, 1, 3)]
-    corners = original(model)
+    corners = corners_of(model)
     for lod in some_lods(model, 3):
         bound_sq = Fraction(model.error_at(lod, side="outward")) ** 2
-        for triangle in corners_at(model, lod).tolist():
+        for triangle in corners_of(model, lod).tolist():
             for weight in weights:
                 point = [sum(Fraction(w, 4) * Fraction(x) for w, x in zip(weight, axis)) for axis in zip(*triangle)]
                 assert exact_distance_sq(point, corners) <= bound_sq
@@ -124,10 +114,10 @@ SHAPES = {
 def test_it_is_tight(name):
     known = name in SHAPES
     model = ab.Model.from_arrays(*SHAPES[name](), base_faces=4) if known else ab.Model.load(real_mesh_path(name))
-    size = np.ptp(original(model), axis=(0, 1)).max()
+    size = np.ptp(corners_of(model), axis=(0, 1)).max()
     for fraction in (0.5, 0.2, 0.05) if known else (0.1, 0.01):
         lod = model.lod_for(fraction=fraction)
-        measured = farthest_distance(corners_at(model, lod), original(model))
+        measured = farthest_distance(corners_of(model, lod), corners_of(model))
         assert measured - 1e-15 * size <= model.error_at(lod, side="outward") <= 1.03 * measured + 1e-12 * size
 
 

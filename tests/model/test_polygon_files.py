@@ -233,6 +233,19 @@ MARKED = {kind: text.encode() for kind, text in MARKED.items()} | {"ply": BOX.ex
 @pytest.mark.parametrize(
     "name, data, message",
     [
+        ("", None, "is a folder"),
+        ("nowhere.obj", None, r"nowhere\.obj: no such file"),
+        ("a.docx", b"", "unknown extension 'docx'; known here: .*obj"),
+        ("a.xyz", b"0 0 0\n1 1 1\n", "no faces .*PointCloud"),
+        ("a.obj", obj(LETTER, []), "no faces"),
+        ("a.obj", b"f 1 2 3\n", "no vertices"),
+        ("a.obj", b"v 0 0 0\nv 1 0 x\n", "line 2 cannot be read"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nf 1 2\n", "line 3 cannot be read"),
+        ("a.obj", b"v 0 0 0\nf 1 2 -2\n", "line 2 refers to a vertex before the first"),
+        ("a.obj", obj(LETTER, FACES).replace(b"v 1 1", b"v nan 1"), "vertex 1 is not finite"),
+        ("a.obj.gz", b"not gzip at all", "cannot be read"),
+        ("a.obj.gz", gzip.compress(obj(LETTER, FACES))[:-20], "cannot be read"),
+        ("a.ply", b"not a ply", "cannot be read as ply"),
         ("a.ply", ply(LETTER, [[0, 1]]), "face 0 has 2 corners"),
         ("a.ply", ply(LETTER, [[0, 1, 2, 8]]), "face 0 refers to vertex 8"),
         ("a.ply", ply(LETTER, [[0, 1, 2, -1]], "<"), "face 0 refers to vertex -1"),
@@ -250,6 +263,8 @@ MARKED = {kind: text.encode() for kind, text in MARKED.items()} | {"ply": BOX.ex
         ("a.off", off(LETTER, FACES, "OFF BINARY\n"), "BINARY is not read"),
         ("a.off", off(LETTER, FACES, "4OFF\n"), "4OFF is not read"),
         ("a.off", b"solid", "does not begin with OFF"),
+        ("a.stl", b"solid x\nfacet\nendsolid", "no faces"),
+        ("a.stl", TEXT.replace(b"vertex ", b"vertex x ", 1), "cannot be read as stl"),
         ("a.stl", BINARY[:90], "no faces: its header declares 12 facets"),
         ("a.stl", BINARY[:80] + bytes(4) + BINARY[84:], "declares 0 facets, and 12 would fit"),
         ("a.stl", BINARY[:80] + bytes(4), "declares 0 facets, and 0 would fit"),
@@ -274,8 +289,10 @@ def test_damaged_files(tmp_path, name, data, message, monkeypatch):
         pytest.importorskip("lxml")
     if name == "a.step":
         monkeypatch.setitem(sys.modules, "cascadio", None)
-    (tmp_path / name).write_bytes(data)
-    for read in (load_mesh, lambda path: ab.scene_from_file(path, device="cpu"))[: 1 if name == "a.usda" else 2]:
+    if data is not None:
+        (tmp_path / name).write_bytes(data)
+    only_meshes = name in ("a.usda", "a.xyz")
+    for read in (load_mesh, lambda path: ab.scene_from_file(path, device="cpu"))[: 1 if only_meshes else 2]:
         caught = refused(ab.MeshError, message, read, tmp_path / name)
         assert str(caught).startswith(f"{tmp_path / name}: ")
 

@@ -48,9 +48,7 @@ class Walker:
 
     def __init__(self, models, objects, device):
         self.models, self.objects, self.device, self.truth = models, objects, device, {}
-        self.scene = ab.Scene(device)
-        for m in objects:
-            self.scene.add(models[m])
+        self.scene = scene_with(device, *[models[m] for m in objects])
 
     def tops(self):
         return np.array([self.models[m].lod_max for m in self.objects])
@@ -67,10 +65,8 @@ class Walker:
         return self.truth[m, lod]
 
     def check_states(self, lods, with_oracle=True):
-        fresh = ab.Scene(self.device)
         placed = list(zip(self.objects, map(int, lods), strict=True))
-        for m, lod in placed:
-            fresh.add(self.models[m], lod=lod)
+        fresh = scene_with(self.device, *[(self.models[m], {"lod": lod}) for m, lod in placed])
         for m, lod in set(placed):
             i = placed.index((m, lod))
             state = raw_state(self.scene, i)

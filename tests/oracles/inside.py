@@ -3,6 +3,7 @@
 import random
 
 import numpy as np
+import trimesh
 
 from oracles.triangle import brute_force_faces, clip, cross, dot, integer_points, into_frame_of_a
 
@@ -37,14 +38,11 @@ def winding_number(point, triangles):
 
 
 def components(faces):
-    """Return lists of rows of faces that share vertices."""
-    groups = []
-    for row, face in enumerate(np.asarray(faces).tolist()):
-        touched = [group for group in groups if group[0] & set(face)]
-        vertices = set(face).union(*(group[0] for group in touched))
-        rows = [row, *(r for group in touched for r in group[1])]
-        groups = [group for group in groups if group not in touched] + [(vertices, rows)]
-    return [rows for _, rows in groups]
+    """Return the rows of faces that share vertices, an array for each component."""
+    faces = np.asarray(faces)
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    labels = trimesh.graph.connected_component_labels(edges)[faces[:, 0]]
+    return [np.flatnonzero(labels == label) for label in np.unique(labels)]
 
 
 def solids_intersect(mesh_a, mesh_b, pose_a, pose_b, solid_a, solid_b):
