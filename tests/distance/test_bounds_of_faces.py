@@ -5,6 +5,7 @@ import warp as wp
 from helpers.nested import speck_cases
 from helpers.questions import launch, pairs_of, scene_of
 from helpers.samples import random_poses, sample
+from helpers.scenes import scene_with
 from oracles.triangle_distance import triangle_distance
 
 import warp_abtree as ab
@@ -78,13 +79,10 @@ def test_slack_is_what_the_proof_adds_up(device):
     """Steps 2 and 3 of `kernels.distance.frame`: 90 u and 96 u of the sizes, 256 u where distances are small."""
     rng, count = np.random.default_rng(2), 12
     model = sample("box")
-    scene = ab.Scene(device)
     poses = random_poses(rng, 2 * count, 1.0)
     poses[:, :3] *= 10.0 ** rng.integers(-2, 4, (2 * count, 1))
-    for pose in poses:
-        scene.add(model, pose)
-    pairs = np.arange(2 * count).reshape(-1, 2)
-    query = ab.DistanceQuery(scene, pairs)
+    scene = scene_with(device, *[(model, pose) for pose in poses])
+    query = ab.DistanceQuery(scene, np.arange(2 * count).reshape(-1, 2))
     query.run()
     reach = np.abs(model.mesh_at(model.lod_max)[0]).max()
     size = 2 * reach + np.abs(poses[1::2, :3] - poses[0::2, :3]).max(1)

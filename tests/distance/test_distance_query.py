@@ -17,11 +17,12 @@ from helpers.questions import (
     random_case,
     scale_cases,
     scene_of,
+    starts_of,
     to_bytes,
     to_matrix,
     true_distances,
 )
-from helpers.samples import corners_of, grid, model_of_faces, random_poses, sample
+from helpers.samples import STILL, corners_of, grid, model_of_faces, random_poses, sample
 from helpers.scenes import scene_with
 from oracles.triangle import quaternion_matrix, triangles_intersect
 
@@ -212,7 +213,7 @@ def test_sweeps(device):
     asked = {"lod_a": a.lod_for(fraction=0.3), "lod_b": b.lod_for(fraction=0.3), "output": "distance", "device": device}
     found = ab.sweep(a, b, poses, **asked)
     some = rng.choice(len(poses), 40, replace=False)
-    cases = [(a, asked["lod_a"], (0, 0, 0, 0, 0, 0, 1), b, asked["lod_b"], poses[i]) for i in some]
+    cases = [(a, asked["lod_a"], STILL, b, asked["lod_b"], poses[i]) for i in some]
     expected = scene_of(device, cases).intersect(pairs_of(cases), "distance")
     for name, of_scene in zip(("distance", "bracket", "points", "faces"), ANSWERS):
         np.testing.assert_array_equal(found[name][some], getattr(expected, of_scene))
@@ -281,9 +282,8 @@ PAIRED = ("torus", "ball"), ("soup", "capsule"), ("twins", "lattice soup"), ("bo
 def make_turns(rng, device, count):
     """Return a scene, and poses and pairs of a number of turns: many surfaces intersect, many faces are as near."""
     cases = [random_case(rng, names, 60) for names in PAIRED * 4]
-    identity = np.array([0.0, 0, 0, 0, 0, 0, 1])
-    cases += [(sample(name), None, identity) * 2 for name in ("box", "grid")] * 3
-    start = np.array([pose for case in cases for pose in (case[2], case[5])])
+    cases += [(sample(name), None, STILL) * 2 for name in ("box", "grid")] * 3
+    start = starts_of(cases)
     turns = []
     for _ in range(count):
         poses = start.copy()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import slow_rows
-from helpers.questions import captured, in_a_row, pairs_of, parted_cases, scene_of, to_matrix
+from helpers.questions import captured, in_a_row, pairs_of, parted_cases, scene_of, starts_of, to_matrix
 from helpers.samples import sample
 from helpers.scenes import scene_with
 from helpers.solids import moved
@@ -57,16 +57,13 @@ def test_gradients_are_slopes(device, names, count, options):
     """Each lies between the slopes before and after, which agree where the nearest points are unique; of any LOD."""
     rng = np.random.default_rng(3)
     cases = parted_cases(rng, names * count, faces=150)
-    scene, pairs = ab.Scene(device), pairs_of(cases)
-    for case in cases:
-        for model, lod, pose in (case[:3], case[3:]):
-            scene.add(model, pose, lod=lod, solid="signed" in options)
+    scene, pairs = scene_of(device, cases, solid="signed" in options), pairs_of(cases)
     pairs[::2] = pairs[::2, ::-1]
     result = scene.intersect(pairs, **{"output": "distance", **options})
     counts = result.distance > 1e-3, result.distance < 0, ~result.any & (result.distance <= 1e-3)
     assert counts[0].mean() > 0.2 and counts[2].mean() < 0.05 and ("signed" not in options or counts[1].mean() > 0.1)
     assert not result.gradient[result.distance == 0].any()
-    before, after = slopes_of(scene, pairs, np.array([pose for case in cases for pose in (case[2], case[5])]), options)
+    before, after = slopes_of(scene, pairs, starts_of(cases), options)
     asked = counts[0] | counts[1]
     # Between kinks a distance bends by the square of the arm over itself.
     bend = 1e-7 + (4 * STEP * (1 + 1 / np.maximum(np.abs(result.distance), 1e-3)))[:, None, None]

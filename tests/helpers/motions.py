@@ -86,7 +86,3 @@ def skewed_boxes(rng, count, kind):
         for poses in matrices:
             poses[k, :3, :3] = poses[k, :3, :3] @ (np.eye(3) + off)
     return models, *matrices
-
-
-def starts_of(cases):
-    return np.array([pose for case in cases for pose in (case[2], case[5])])

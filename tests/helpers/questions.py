@@ -42,17 +42,18 @@ def sort_rows(rows):
     return rows[np.lexsort(rows.T[::-1])]
 
 
-def scene_of(device, cases):
+def scene_of(device, cases, **options):
     """Return a scene of cases (model a, lod a, pose a, model b, lod b, pose b): case p is objects (2 p, 2 p + 1)."""
-    scene = ab.Scene(device)
-    for model_a, lod_a, pose_a, model_b, lod_b, pose_b in cases:
-        scene.add(model_a, pose_a, lod=lod_a)
-        scene.add(model_b, pose_b, lod=lod_b)
-    return scene
+    objects = [(model, pose, {"lod": lod}) for case in cases for model, lod, pose in (case[:3], case[3:])]
+    return scene_with(device, *objects, **options)
 
 
 def pairs_of(cases):
     return np.arange(2 * len(cases)).reshape(-1, 2)
+
+
+def starts_of(cases):
+    return np.array([pose for case in cases for pose in (case[2], case[5])])
 
 
 def ask(device, cases, **options):
@@ -60,8 +61,7 @@ def ask(device, cases, **options):
 
 
 def in_a_row(device, name, places):
-    scene = scene_with(device, *[(sample(name), (x, 0, 0, 0, 0, 0, 1)) for x in places])
-    return scene
+    return scene_with(device, *[(sample(name), (x, 0, 0, 0, 0, 0, 1)) for x in places])
 
 
 def random_lod(rng, model, most_faces):

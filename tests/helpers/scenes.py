@@ -63,9 +63,8 @@ def set_lods(frame, lods):
 
 def check_states(frame, scene):
     """Check that every object's state in a frame holds the bits of a state built at the scene's LODs."""
-    fresh = ab.Scene(scene.device)
-    for m, lod in zip(scene.object_model, scene.lods):
-        fresh.add(scene.models[m], lod=int(lod))
+    objects = [(scene.models[m], {"lod": int(lod)}) for m, lod in zip(scene.object_model, scene.lods)]
+    fresh = scene_with(scene.device, *objects)
     for i in range(scene.object_count):
         truth = raw_state(fresh, i)
         state = stored_state(scene.models, frame.batch, frame.batch.objects.pool.state.numpy()[i])

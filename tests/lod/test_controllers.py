@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.bodies import strewn
+from helpers.scenes import scene_with
 
 import warp_abtree as ab
 from warp_abtree.app import load_scene
@@ -58,9 +59,7 @@ class Plant:
 
     def __init__(self, finest_ms=20.0, budget_ms=5.0, exponent=0.55, count=40):
         models = rings()
-        self.scene, self.exponent = ab.Scene(device="cpu"), exponent
-        for i in range(count):
-            self.scene.add(models[i % 2])
+        self.scene, self.exponent = scene_with("cpu", *[models[i % 2] for i in range(count)]), exponent
         self.pairs = np.stack([np.arange(count - 1), np.arange(1, count)], 1)
         self.controller = PredictiveController(self.scene, budget_ms)
         self.rows, self.heard, self.lods = [], {}, self.scene.lods * 0

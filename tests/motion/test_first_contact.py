@@ -5,8 +5,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from helpers import refused
-from helpers.motions import ANSWERS, STILL, find, random_motions, starts_of, to_bytes
-from helpers.questions import captured, in_a_row, pairs_of, scene_of
+from helpers.motions import ANSWERS, STILL, find, random_motions, to_bytes
+from helpers.questions import captured, in_a_row, pairs_of, scene_of, starts_of
 from helpers.samples import model_of_faces, random_poses, sample
 from helpers.scenes import scene_with
 from oracles.motion import pose_between, translation_contact

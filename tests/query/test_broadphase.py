@@ -232,10 +232,9 @@ def test_more_pairs_than_can_be_numbered(device, search):
 
 
 def test_thousand_worlds(device):
-    scene, worlds = ab.Scene(device), np.concatenate([1001 * np.repeat(np.arange(1000), 3), [-1, -1]])
-    worlds = np.random.default_rng(3).permutation(worlds)
-    for world in worlds:
-        scene.add(sample("box"), world=int(world))
+    worlds = np.concatenate([1001 * np.repeat(np.arange(1000), 3), [-1, -1]])
+    scene, worlds = ab.Scene(device), np.random.default_rng(3).permutation(worlds)
+    scene.add_many(sample("box"), np.tile(STILL, (len(worlds), 1)), worlds)
     expected = np.argwhere(np.triu((worlds[:, None] == worlds) | (worlds[:, None] == -1) | (worlds == -1), 1))
     np.testing.assert_array_equal(scene.broad_phase(), expected)
     np.testing.assert_array_equal(sort_rows(scene.intersect().pairs), expected)

@@ -140,10 +140,9 @@ def visit_in_cpp(pair: wp.int32, faces: wp.vec2i, trees: Trees, pose: PairPose, 
 
 @pytest.mark.parametrize(("visit", "hits"), [(visit_all_ways, [False, True]), (visit_in_cpp, [True, True])])
 def test_takes_what_returns_on_all_ways(device, visit, hits):
-    scene = ab.Scene(device=device)
-    for _ in range(2):
-        scene.add(ab.Model.load(trimesh.creation.box()))
-    assert FaceQuery(scene, visit, LeastDistance(), [(0, 1), (1, 0)]).run().any.tolist() == hits
+    box = ab.Model.load(trimesh.creation.box())
+    query = FaceQuery(scene_with(device, box, box), visit, LeastDistance(), [(0, 1), (1, 0)])
+    assert query.run().any.tolist() == hits
 
 
 @pytest.mark.parametrize(

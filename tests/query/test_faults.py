@@ -13,6 +13,7 @@ from helpers import faults, refused
 from helpers.faults import MORE_PAIRS, PAIRS, add_objects, check_scene, describe, make_scene
 from helpers.questions import GpuQuery, in_a_row
 from helpers.samples import random_poses, sample
+from helpers.scenes import scene_with
 
 import warp_abtree as ab
 from warp_abtree import testing
@@ -201,10 +202,8 @@ def test_sweeps(device, interruption):
 
 def test_bodies(device, interruption):
     def make():
-        scene = ab.Scene(device)
-        for height in (0, 0.9, 1.85):
-            scene.add(sample("box"), pose=(0.1 * (height > 0), 0, height, 0, 0, 0, 1), static=height == 0)
-        bodies = ab.Dynamics(scene)
+        placed = [((0, 0, 0), {"static": True}), ((0.1, 0, 0.9), {}), ((0.1, 0, 1.85), {})]
+        bodies = ab.Dynamics(scene_with(device, *[(sample("box"), (*p, 0, 0, 0, 1), own) for p, own in placed]))
         bodies.step(1e-3)
         return bodies
 

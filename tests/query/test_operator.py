@@ -6,6 +6,7 @@ import warp as wp
 from helpers import refused
 from helpers.faults import MORE_PAIRS, add_objects, check_buffer_lengths
 from helpers.samples import random_poses, sample
+from helpers.scenes import scene_with
 
 import warp_abtree as ab
 from warp_abtree import testing
@@ -122,9 +123,7 @@ def test_distances_after_more_tree_states_than_there_was_room_for(device, monkey
 
     empty, most = wp.empty, sample("ball").lod_max
     for regime in ({}, {"warps": True}):
-        scene = ab.Scene(device)
-        for i in range(4):
-            scene.add(sample("ball"), (2.2 * i, 0.3 * i, 0.2 * i, 0, 0, 0, 1))
+        scene = scene_with(device, *[(sample("ball"), (2.2 * i, 0.3 * i, 0.2 * i, 0, 0, 0, 1)) for i in range(4)])
         with testing.regime(**regime), monkeypatch.context() as patch:
             query = ab.DistanceQuery(scene, [(0, 1), (1, 2), (2, 3)] * 12)
             query.run()

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 import trimesh
 import warp as wp
+from helpers.scenes import scene_with
 
 import warp_abtree as ab
 from warp_abtree.checks import kernel_loading
@@ -156,9 +157,8 @@ def test_all_that_a_first_query_launches_is_loaded_before(device, monkeypatch, o
         "launch",
         lambda kernel, *given, **named: (launched.append(kernel.module), launch(kernel, *given, **named))[1],
     )
-    scene = ab.Scene(device)
-    for x in (0.0, 3.0 if output == "distance" else 0.5):
-        scene.add(ball, (x, 0.1, 0.2, 0, 0, 0, 1))
+    places = 0.0, 3.0 if output == "distance" else 0.5
+    scene = scene_with(device, *[(ball, (x, 0.1, 0.2, 0, 0, 0, 1)) for x in places])
     with regime(warps=warps, packs_results=warps, segments=warps or None):
         scene.intersect([(0, 1)] if output == "distance" else None, output=output)
     assert {module.name for module in launched if "packer" not in module.name} == {module.name for module in loaded}
