@@ -29,16 +29,6 @@ def bumpy_grid():
     return np.stack([x, y, 0.7 * np.sin(x) * np.cos(1.3 * y)], 1), faces
 
 
-def fan(rim=60):
-    """Two hubs of very many faces, joined along a rim."""
-    angle = np.linspace(0, 2 * np.pi, rim, endpoint=False)
-    circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
-    i = np.arange(rim)
-    up = np.stack([i, (i + 1) % rim, 0 * i + rim], 1)
-    down = np.stack([(i + 1) % rim, i, 0 * i + rim + 1], 1)
-    return np.concatenate([circle, [[0, 0, 1.0], [0, 0, -1.0]]]), np.concatenate([up, down])
-
-
 MESHES = {
     "torus": lambda: of_trimesh(trimesh.creation.torus(1.0, 0.4, 24, 12)),
     "sphere": lambda: of_trimesh(trimesh.creation.icosphere(3)),
@@ -47,7 +37,8 @@ MESHES = {
     "flat grid": lambda: samples.grid(12),
     "bumpy grid": bumpy_grid,
     "crumbs": lambda: samples.crumbs(30),
-    "fan": fan,
+    # Two hubs of very many faces, joined along a rim.
+    "fan": lambda: of_trimesh(trimesh.creation.revolve([[0, -1], [1, 0], [0, 1]], sections=60)),
     "line": lambda: samples.line((1.0, 2.0, -1.0)),
     "one face": lambda: (np.eye(3), [[0, 1, 2]]),
     "same face often": lambda: (np.eye(3), [[0, 1, 2]] * 5 + [[2, 1, 0]]),

@@ -12,10 +12,8 @@ HAS_LONG = np.finfo(LONG).nmant >= 63
 
 
 def cross_matrices(axis):
-    k = np.zeros((len(axis), 3, 3), LONG)
-    for i, j, n, sign in ((2, 1, 0, 1), (0, 2, 1, 1), (1, 0, 2, 1), (1, 2, 0, -1), (2, 0, 1, -1), (0, 1, 2, -1)):
-        k[:, i, j] = sign * axis[:, n]
-    return k
+    """Return the matrices (n, 3, 3) that take v to axis x v."""
+    return np.cross(axis[:, None], np.eye(3, dtype=LONG)).swapaxes(1, 2)
 
 
 def shortest_turns(first, last):
