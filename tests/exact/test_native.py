@@ -157,19 +157,14 @@ def test_modules_name_the_headers_that_their_kernels_need():
         python, group = importlib.import_module(name), name.removeprefix(f"{kernels.__name__}.")
         found = [value for value in vars(python).values() if isinstance(value, wp.Kernel)]
         found += MAKERS.get(group, lambda made: [])(python)
-        needed = {file for file in native.BASE}
-        needed |= {header_of[called(f)] for kernel in found for f in reached(kernel.adj, set()) if called(f)}
+        needed = [*native.BASE, *(header_of[called(f)] for k in found for f in reached(k.adj, set()) if called(f))]
+        expected = {}
+        for file in needed:
+            native.add_header(expected, file)
         given = [kernel.module.options["extra_build_options"] for kernel in found]
         preambles = {options.extra_cpu_preamble for options in given if options}
         parsed = {file for file in FILES if any(texts[file] in preamble for preamble in preambles)}
-        assert not preambles or texts.keys() & parsed == closure(needed), name
-
-
-def closure(files):
-    texts = {}
-    for file in files:
-        native.add_header(texts, file)
-    return texts.keys()
+        assert not preambles or texts.keys() & parsed == expected.keys(), name
 
 
 def test_constants_are_those_of_python():

@@ -5,7 +5,8 @@ from functools import cache
 
 import numpy as np
 import warp as wp
-from oracles.distance import mesh_distance
+from oracles.distance import brute_distances, mesh_distance
+from oracles.motion import posed
 
 import warp_abtree as ab
 from helpers.samples import SHAPES, contact_poses, sample
@@ -131,6 +132,15 @@ def true_distances(scene, cases):
     """Return the distance of each pair by brute force, 0 where they intersect."""
     met = scene.intersect(pairs_of(cases)).any
     return np.array([0.0 if hit else mesh_distance(*case) for hit, case in zip(met, cases, strict=True)])
+
+
+def check_points(result, cases):
+    """Check that points lie on the faces that are named, of the meshes at their LODs, where any are."""
+    for row, faces, case in zip(result.points, result.point_faces, cases, strict=True):
+        for point, face, (model, lod, pose) in zip(row, faces, (case[:3], case[3:]), strict=True):
+            if face >= 0:
+                vertices, corners, ids = model.mesh_at(lod)
+                assert brute_distances(point[None], posed(vertices[corners[ids == face]], pose))[0] < 1e-12
 
 
 def to_bytes(result, names=("distance", "bracket", "points", "point_faces")):
