@@ -1,10 +1,13 @@
-"""No bound is too large: faces that are nearer by a part in 10^8 than very many others are found, slabs or not."""
+"""No bound is too large: faces that are nearer by a part in 10^8 than very many others are found, slabs or not.
+
+Mean slabs of nodes and balls about their boxes' centres hold the faces below, and are no larger than need be.
+"""
 
 import numpy as np
 import pytest
 from conftest import slow
 from helpers.questions import pairs_of, scene_of, to_bytes, to_matrix
-from helpers.samples import STILL, grid, random_quaternions
+from helpers.samples import STILL, grid, mirrored, random_quaternions, sample
 from oracles.distance import mesh_distance
 from oracles.triangle import quaternion_matrix
 
@@ -119,7 +122,7 @@ def test_margins_of_slabs_cover_roundings_that_add_up(device, case):
     faces = np.reshape(corners, (2, 3, 3))
     rotation = quaternion_matrix(quaternion)
     pose = to_matrix(rotation, faces[0][0] - rotation @ faces[1][0] + apart)
-    a, b = (ab.Model.from_arrays(np.concatenate([face, -face]), [[0, 1, 2], [3, 4, 5]]) for face in faces)
+    a, b = map(mirrored, faces)
     scene = scene_of(device, [(a, None, STILL, b, None, pose)])
     pairs = [(0, 1)] * int(PAIRS_LEAST)
     distance = mesh_distance(a, a.lod_max, STILL, b, b.lod_max, pose)
@@ -146,7 +149,7 @@ def beside_one_another(rng, length=3000.0, reach=1e-2):
     turn = quaternion_matrix(random_quaternions(rng, 1)[0])
     aside = reach * np.array([[0, 0], [-1, 1e-4], [-1, -1e-4]]) @ [way, rod]
     ends = 0.5 * length * rod + aside, (-0.5 * length * rod - aside) @ turn
-    a, b = (ab.Model.from_arrays(np.concatenate([face, -face]), [[0, 1, 2], [3, 4, 5]]) for face in ends)
+    a, b = map(mirrored, ends)
     return a, a.lod_max, STILL, b, b.lod_max, to_matrix(turn, length * rod + way)
 
 
@@ -173,3 +176,48 @@ def test_slabs_leave_off_what_roundings_add_up_to():
     assert room >= max(*along, *across) and int(BOUND_MARGINS) == native.constant("SLAB_MARGINS")
     assert "boxes.margin = SLAB_MARGINS * scaling.margin;" in native.read("distance/search.h")
     assert native.read("distance/slab_bounds.h").count(" - margin)") == 3  # along n, across it, along a node's own
+
+
+def read_slabs(device, model, lod):
+    """Return a state of a model, and the records of its nodes: normal, ends, weight and radius, float32 (nodes, 7)."""
+    scene = scene_of(device, [(model, lod, STILL, sample("box"), None, STILL)])
+    query = ab.DistanceQuery(scene, [(0, 1)] * max(int(PAIRS_LEAST), int(USES_MIN)))
+    for _ in range(2):
+        query.launch()
+    slabs = query.stages[-1].slabs
+    assert slabs.made.numpy()[0, 0] == lod
+    state = scene.tree_state(0)
+    records = slabs.record.numpy().reshape(-1, 8)[: len(state.status), :7]  # of inactive nodes no numbers
+    return state, records
+
+
+@pytest.mark.parametrize("name", ["torus", "soup", "crumbs", "lattice soup"])
+@pytest.mark.parametrize("part", [1.0, 0.6, 0.1])
+def test_slabs_and_balls_hold_their_faces(device, regime, name, part):
+    """Of every active node; a leaf's ball reaches its farthest corner, another's no farther than its box does."""
+    model = sample(name)
+    lod = round(part * model.lod_max)
+    state, records = read_slabs(device, model, lod)
+    vertices, faces, ids = model.mesh_at(lod)
+    near = vertices - model.centre
+    rounding = 2.0**-22 * np.abs(near).max()  # of vertices to float32, and of ends
+    leaves, corners, checked = state.face_node[ids], near[faces], [0, 0]
+    for node in np.flatnonzero(state.status):
+        below = corners[leaves >> np.maximum(depth_of(leaves) - depth_of(node), 0) == node]
+        assert len(below)
+        normal, (low, high, _, radius) = np.split(records[node].astype(float), [3])
+        along, middle = below @ normal, (state.lower[node] + state.upper[node]) / 2 - model.centre
+        reach = np.linalg.norm(below - middle, axis=2).max()
+        assert abs(np.linalg.norm(normal) - 1) < 1e-6 or not normal.any()
+        assert low <= along.min() + rounding and along.max() - rounding <= high
+        assert reach - rounding <= radius <= np.linalg.norm(state.upper[node] - state.lower[node]) / 2 + rounding
+        if len(below) == 1:
+            assert radius <= reach + rounding and high - low <= np.ptp(along) + 2 * rounding
+        half = np.linalg.norm(state.upper[node] - state.lower[node]) / 2
+        checked[int(len(below) > 1 and radius < 0.98 * half)] += 1
+    assert sum(checked) > 8 and (checked[1] > 0 or name != "soup")
+
+
+def depth_of(node):
+    """Return the level of heap indices, the root's 0."""
+    return np.frexp(np.asarray(node, float))[1] - 1

@@ -5,7 +5,7 @@ from oracles.triangle import into_frame_of_a, quaternion_matrix
 from oracles.triangle_distance import triangle_distance
 
 import warp_abtree as ab
-from helpers.samples import STILL, random_poses, random_quaternions, sample
+from helpers.samples import STILL, mirrored, model_of_faces, random_poses, random_quaternions, sample
 
 STEP = 2.0**-23  # of float32 from 1 to 2
 
@@ -59,7 +59,6 @@ def speck_cases(rng, count, gap, size=1e-3):
         face = np.stack([corner, *(corner + size * (rng.normal(size=(2, 2)) @ across - 0.1 * out))])
         above = size * (rng.normal(size=(2, 2)) @ across + rng.uniform(0.5, 1, (2, 1)) * out)
         speck = np.concatenate([np.zeros((1, 3)), above @ quaternion_matrix(pose[3:])])
-        a = ab.Model.from_arrays(np.concatenate([face, -face]), [[0, 1, 2], [3, 4, 5]])
-        cases.append((a, None, np.array(STILL), ab.Model.from_arrays(speck, [[0, 1, 2]]), None, pose))
+        cases.append((mirrored(face), None, np.array(STILL), model_of_faces(speck), None, pose))
         distances.append(triangle_distance(face, into_frame_of_a(speck, STILL, pose)))
     return cases, np.array(distances)
