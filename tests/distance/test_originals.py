@@ -74,13 +74,6 @@ def test_brackets_hold_the_originals(device, seed, options, swapped):
             check_points(result, finest(cases))
 
 
-def make_spike():
-    """Return a sheet with a spike of 0.2 in its middle, which coarse LODs lack."""
-    vertices, faces = grid(8)
-    vertices[40, 2] = 1.6
-    return ab.Model.from_arrays((vertices - [4, 4, 0]) / 8, faces, base_faces=2)
-
-
 def test_without_tolerance_the_answer_is_that_of_the_finest(device):
     cases = random_cases(np.random.default_rng(2), 20)
     expected = scene_of(device, finest(cases)).intersect(pairs_of(cases), "distance")
@@ -148,8 +141,11 @@ def test_solids(device):
 
 
 def test_the_broad_phase_finds_what_lods_leave_out(device):
-    """Boxes of LODs that are apart, of originals that are not."""
-    scene = scene_with(device, *[(make_spike(), (0, 0, z, 0, 0, 0, 1)) for z in (0.0, 0.15)], lod=0)
+    """Boxes of LODs that are apart, of originals that are not: sheets with spikes of 0.2 that coarse LODs lack."""
+    vertices, faces = grid(8)
+    vertices[40, 2] = 1.6
+    spike = ab.Model.from_arrays((vertices - [4, 4, 0]) / 8, faces, base_faces=2)
+    scene = scene_with(device, *[(spike, (0, 0, z, 0, 0, 0, 1)) for z in (0.0, 0.15)], lod=0)
     assert len(scene.broad_phase()) == 0
     found = scene.intersect(output="distance", originals=True)
     np.testing.assert_array_equal(found.pairs, [[0, 1]])

@@ -188,16 +188,13 @@ def compile_alone(text, folder):
 
 
 def test_preamble_holds_each_header_once_after_what_it_includes():
-    """Warp hashes the text, so that a change of any file compiles anew."""
-    text = native.options("exact/determinant.cuh", "contacts/contacts.h")["extra_build_options"].extra_cpu_preamble
+    """Warp hashes the text, so that a change of any file compiles anew. CUDA does not parse headers of the CPU."""
+    options = native.options("exact/determinant.cuh", "contacts/contacts.h")["extra_build_options"]
+    text, on_cuda = options.extra_cpu_preamble, options.extra_cuda_preamble
     assert "#include" not in text and "#pragma once" not in text
     places = [text.index(f"struct {word} ") for word in ("Points64", "DoubleWords", "Contact64")]
     assert places == sorted(places) and text.count("struct DoubleWords {") == text.count("struct WideInteger {") == 1
-
-
-def test_cuda_does_not_parse_headers_of_the_cpu():
-    options = native.options("search/slabs.cuh", "contacts/contacts.h")["extra_build_options"]
-    assert "struct Contact64" not in options.extra_cuda_preamble and "is_last_block" in options.extra_cuda_preamble
+    assert "struct Contact64" not in on_cuda and "struct DoubleWords {" in on_cuda
 
 
 @pytest.mark.parametrize("files", [FILES, *slow(FILES[::-1])], ids=["in order", "reversed"])

@@ -257,6 +257,7 @@ def test_open_solids_are_refused_by_their_edges(device):
     scene = ab.Scene(device)
     told = r"'torn' is no solid.*3 edges belong to an odd number of faces: \("
     found = refused(ab.MeshError, told, scene.add, torn, solid=True)
+    assert describe_mesh(mesh_from_arrays(TORUS.vertices, TORUS.faces[1:]))["solid"] == "no: not closed"
     corner = ", ".join(f"{x:.6g}" for x in TORUS.vertices[TORUS.faces[0][0]])
     assert f"({corner})" in str(found) and scene.object_count == 0
     refused(ValueError, "solid 1 is neither", scene.add, torn, solid=1)

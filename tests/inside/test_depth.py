@@ -102,8 +102,7 @@ def test_closed_forms(device):
     # Coincident: every sample lies on the other surface.
     assert ask(device, [(BOX, moved(), True), (BOX, moved(), True)], **DEPTH).distance[0] == 0
 
-
-def test_in_a_cavity_distances_stay_positive(device):
+    # In a cavity distances stay positive.
     hollow = model_of(voxel_mesh(shell(5)), "hollow")
     found = ask(device, [(hollow, moved(), True), (BALL, moved(2.5, 2.5, 2.5), True)], **DEPTH)
     assert 0.99 < found.distance[0] < 1.01

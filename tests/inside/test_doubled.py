@@ -95,11 +95,6 @@ def test_what_holds_nothing_says_so(device, name):
     assert found.tolist() == held and len(said) == (count > 0)
 
 
-def test_an_open_mesh_is_no_solid():
-    told = describe_mesh(mesh_from_arrays(BOX.vertices, BOX.faces[1:]))
-    assert told["solid"] == "no: not closed"
-
-
 def test_the_warning_points_to_the_line_that_called_the_library():
     doubled = trimesh.util.concatenate([BOX, BOX])
     model, scene = ab.Model.load(doubled), ab.Scene("cpu")

@@ -142,8 +142,8 @@ def test_the_broad_phase_finds_all_that_touch(device, path):
     assert times[0] == times[1]
 
 
-def test_calls_that_repeat_take_other_options(device):
-    """On a GPU they are a graph after a few; tolerance, screws and end poses still count."""
+def test_calls_that_repeat_and_graphs_follow_what_is_asked(device):
+    """On a GPU they are a graph after a few; tolerance, screws and end poses still count; of graphs end poses too."""
     cases, ends = random_motions(np.random.default_rng(9), 40)
     scene, pairs, seen = scene_of(device, cases), pairs_of(cases), set()
     others = np.roll(ends.reshape(-1, 2, 7), 1, axis=0).reshape(-1, 7)
@@ -155,11 +155,6 @@ def test_calls_that_repeat_take_other_options(device):
             assert to_bytes(found) == to_bytes(fresh)
             seen.add(found.time.tobytes())
     assert len(seen) == 6, "options change nothing"
-
-
-def test_captured_graphs(device):
-    cases, ends = random_motions(np.random.default_rng(10), 20)
-    scene, pairs = scene_of(device, cases), pairs_of(cases)
     query = ab.FirstContactQuery(scene, ends, pairs)
     first = query.run()
     replay = captured(query)

@@ -128,29 +128,23 @@ def test_nothing_to_find(device, packs):
 @pytest.mark.parametrize("keeps", [False, True], ids=["host", "device"])
 @pytest.mark.parametrize("output", ["faces", "contacts"])
 def test_overflow_is_told(device, packs, output, keeps):
-    """`launch` cannot grow: what there is room for is given, and `check` names the demand."""
+    """`launch` cannot grow: what there is room for is given, and `check` names the demand. None without a launch."""
     scene = add_objects(device)
     whole = scene.intersect(MORE_PAIRS, output)
     query = make_query(scene, output, capacity=ab.Buffers(hits=5))
+    refused(RuntimeError, "nothing was launched", query.result, device=keeps)
     query.launch()
     short = query.result(device=keeps)
     assert len(short.faces) == 5
     refused(ab.CapacityError, rf"Buffers\(hits={len(whole.faces)}\)", short.check)
     assert len(query.run(device=keeps).faces) == len(whole.faces)
+    query.set_pairs(MORE_PAIRS)
+    refused(RuntimeError, "nothing was launched", query.result, device=keeps)
     found = make_query(scene, output, pairs=None, capacity=ab.Buffers(pairs=2))
     found.launch()
     short = found.result(device=keeps)
     assert len(short.pairs) == 2
     refused(ab.CapacityError, rf"Buffers\(pairs={len(scene.broad_phase())}\)", short.check)
-
-
-@pytest.mark.parametrize("keeps", [False, True], ids=["host", "device"])
-def test_without_a_launch_there_is_no_result(device, packs, keeps):
-    query = ab.Query(add_objects(device), "faces", pairs=MORE_PAIRS)
-    for _ in range(2):
-        refused(RuntimeError, "nothing was launched", query.result, device=keeps)
-        assert query.run(device=keeps).any.shape == (len(MORE_PAIRS),)
-        query.set_pairs(MORE_PAIRS)
 
 
 def test_hits_that_vary_are_read_whole(device, packs, monkeypatch):

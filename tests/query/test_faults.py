@@ -279,9 +279,11 @@ def test_overflow_names_the_demand(crowd, kind):
     assert len(query.result().faces) == len(whole.faces)
 
 
-@pytest.fixture
-def asked(device):
-    """A scene, a query about it, and a check that both are as they were."""
+def test_what_no_device_or_launch_holds_is_refused(device, monkeypatch):
+    """The largest buffers that may be asked for, so many entries of three integers, refused as a full device does.
+
+    And more pairs than a launch holds. A scene and a query about it are as they were.
+    """
     scene = make_scene(device)
     before, query = check_scene(None, scene), ab.Query(scene, "faces", pairs=PAIRS)
     answers = describe(query.run())
@@ -290,12 +292,6 @@ def asked(device):
         check_scene(before, scene)
         assert describe(query.run()) == answers
 
-    return scene, query, check
-
-
-def test_the_error_names_the_bytes(device, asked, monkeypatch):
-    """The largest buffers that may be asked for: so many entries of three integers, refused as a full device does."""
-    scene, query, check = asked
     allocator = wp.get_device(device).get_allocator()
     allocate, sizes = allocator.allocate, []
 
@@ -313,10 +309,7 @@ def test_the_error_names_the_bytes(device, asked, monkeypatch):
         assert sizes[-1] == 12 * (2**31 - 1)
         check()
 
-
-def test_more_pairs_than_a_launch_holds(asked, monkeypatch):
     monkeypatch.setattr(request, "PAIRS_MAX", len(MORE_PAIRS))
-    scene, query, check = asked
     ab.Query(scene, pairs=MORE_PAIRS)  # as many as it holds
     refused(ValueError, "buffers: pairs 13 is outside", ab.Buffers, pairs=13)
     many = np.concatenate([MORE_PAIRS, PAIRS])
