@@ -179,8 +179,7 @@ def test_fit_finds_slope_and_intercept():
         fit.add(work, 1.0 + 0.6 * work)
     assert fit.line() == pytest.approx((0.6, 1.0), rel=1e-2)
 
-
-def test_fit_is_never_negative():
+    # Neither is ever negative.
     falling, below = CostFit(), CostFit()
     for work in (1.0, 2.0, 3.0, 4.0):
         falling.add(work, 10.0 - work)

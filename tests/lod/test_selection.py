@@ -7,13 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import trimesh
 import warp as wp
 from helpers import refused
 from helpers.bodies import selection_models, strewn
-from helpers.samples import grid
+from helpers.samples import corners_of, grid
 from helpers.scenes import scene_with
 from oracles.distance import brute_distances, exact_distance_sq, lattice_points
+from oracles.motion import posed
 
 from warp_abtree.lod.controllers import Feedback, PaperController, PredictiveController, ToleranceController
 from warp_abtree.lod.view import Camera, View
@@ -284,13 +284,10 @@ def test_view_measures_distance_motion_and_focus(device):
         scene.set_poses(poses)
         view.look(camera)
         view.launch()
-        rotation = trimesh.transformations
         alpha, way = np.empty(40), np.zeros(40)
         for i in range(40):
-            x, y, z, w = poses[i, 3:]
-            turn = rotation.quaternion_matrix([w, x, y, z])[:3, :3]
             centre = scene.models[scene.object_model[i]].centre
-            alpha[i], place = see(camera, turn @ centre + poses[i, :3])
+            alpha[i], place = see(camera, posed(centre, poses[i]))
             if place is not None and last[i] is not None:
                 way[i] = math.dist(place, last[i])
             last[i] = place
@@ -317,8 +314,7 @@ def test_no_vertex_lies_beyond_the_error():
         progressive = build_progressive(bumpy_sheet(2, 0.3, seed), base_faces=1)
         original = [[Fraction(x) for x in p] for p in progressive.vertex_pos[: progressive.vertex_count].tolist()]
         for lod in range(progressive.lod_max):
-            vertices, faces, _ = progressive.mesh_at(lod)
-            farthest = max(exact_distance_sq(p, vertices[faces]) for p in original)
+            farthest = max(exact_distance_sq(p, corners_of(progressive, lod)) for p in original)
             bound = Fraction(float(progressive.lod_error[lod])) ** 2
             assert farthest <= bound
             close += farthest > bound * (1 - Fraction(2) ** -36)
@@ -335,7 +331,6 @@ def test_covers_on_fewer_faces_than_they_want_are_measured_again(slots, monkeypa
     progressive = build_progressive(mesh, base_faces=1)
     points = lattice_points(plenty.vertex_pos[mesh.faces], 4)
     for lod in range(0, progressive.lod_max, 5):
-        vertices, faces, _ = progressive.mesh_at(lod)
-        assert brute_distances(points, vertices[faces]).max() <= progressive.lod_error[lod] + 1e-13
+        assert brute_distances(points, corners_of(progressive, lod)).max() <= progressive.lod_error[lod] + 1e-13
         looser += progressive.lod_error[lod] > plenty.lod_error[lod]
     assert looser > 0, "there is no want of slots here"

@@ -82,6 +82,7 @@ def test_a_glb_that_refers_to_files_is_read_again(folder, tmp_path):
 def test_a_file_that_comes_again_is_opened(folder, built, ball):
     first, second = ab.Model.load(ball), ab.Model.load(str(ball))
     assert built == ["ball"] and len(list(folder.iterdir())) == 1
+    assert os.name == "nt" or stat.S_IMODE(folder.stat().st_mode) == 0o700, "the folder is the user's alone"
     assert second.digest == first.digest and second.name == "ball" and second.error_at(7) == first.error_at(7)
     shutil.copy(ball, ball.with_name("copy.obj"))
     assert ab.Model.load(ball.with_name("copy.obj")).name == "copy" and built == ["ball"]
@@ -141,12 +142,6 @@ def test_small_models_and_those_beyond_the_limit_are_not_kept(folder, built, bal
     monkeypatch.setattr(cache, "SIZE_LIMIT", 1000)
     ab.Model.load(ball)
     assert len(built) == 3 and not folder.exists()
-
-
-@pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
-def test_the_folder_is_the_users_alone(folder, ball):
-    ab.Model.load(ball)
-    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
 def test_where_the_folder_is(monkeypatch, tmp_path):
@@ -222,7 +217,7 @@ def test_files_of_other_programs_stay(folder, ball):
 @pytest.mark.skipif(os.name == "nt", reason="pipes and links of POSIX")
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda path: os.symlink(path, path)])
 def test_what_is_no_file_is_passed_by(folder, built, ball, make):
-    """Under the name of a model, which a pipe would make wait for ever, and under that of its errors."""
+    """Under the name of a model, which a pipe would make wait for ever, and under that of its errors; and as a mesh."""
     ab.Model.load(ball, certify=True)
     paths = list(folder.iterdir())
     for path in paths:
@@ -231,9 +226,5 @@ def test_what_is_no_file_is_passed_by(folder, built, ball, make):
     built.clear()
     model = ab.Model.load(ball, certify=True)
     assert built == ["ball"] and model.error_at(0) > 0 and len(paths) == 2
-
-
-@pytest.mark.skipif(os.name == "nt", reason="pipes of POSIX")
-def test_a_mesh_that_is_no_file_has_no_key(tmp_path):
-    os.mkfifo(tmp_path / "ball.obj")
-    assert cache.file_key(tmp_path / "ball.obj") is None
+    make(ball.with_name("other.obj"))
+    assert cache.file_key(ball.with_name("other.obj")) is None

@@ -102,13 +102,12 @@ def strips(ys, length):
     return abtree.Progressive([-1] * len(position), position, faces, [0] * len(ys), [0], [])
 
 
-def test_few_faces_split_on_the_longest_axis():
-    """Four faces along y, the two middle ones with equal keys: the lower index goes left."""
-    assert [leaf.number for leaf in abtree.active_build(strips((9, 4, 4, 0), 1)).leaf] == [7, 5, 6, 4]
-
-
 @pytest.mark.parametrize(("count", "first"), [(9, {0, 1, 2, 3}), (10, {1, 3, 5, 7, 9})])
 def test_many_faces_split_where_the_halves_are_smallest(count, first):
-    """Long strips, by index from both ends of y: split along x, their longest axis, both halves have all of y."""
+    """Long strips, by index from both ends of y: split along x, their longest axis, both halves have all of y.
+
+    Few go by the longest axis: of four along y, the two middle ones with equal keys, the lower index goes left.
+    """
     tree = abtree.active_build(strips([-i if i % 2 else i for i in range(count)], 20))
     assert {i for i, leaf in enumerate(tree.leaf) if bin(leaf.number)[3] == "0"} == first
+    assert [leaf.number for leaf in abtree.active_build(strips((9, 4, 4, 0), 1)).leaf] == [7, 5, 6, 4]
