@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 from helpers.questions import launch
+from oracles.signs import random_floats
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.quotients import divide32, normalize32, root32
@@ -36,10 +37,7 @@ def all_mantissas():
 
 
 def random_numbers(rng, count, least, most):
-    """Return numbers of either sign with exponents of a range."""
-    return np.ldexp(rng.uniform(1, 2, count) * rng.choice([-1, 1], count), rng.integers(least, most, count)).astype(
-        np.float32
-    )
+    return random_floats(rng, count, least, most).astype(np.float32)
 
 
 def assert_same_bits(found, expected):

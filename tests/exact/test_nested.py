@@ -15,14 +15,6 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.search import descent
-from warp_abtree.kernels.search.descent import (
-    CPU_STACK_LENGTH,
-    WAITING_LENGTH,
-    Descent,
-    descend_subtrees,
-    open_subtrees,
-    slab_memory_words,
-)
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
 
 wp.set_module_options(native.options("search/open_subtrees.h", "search/subtrees.h"))
@@ -60,13 +52,14 @@ def test_many_subtrees_share_little_memory(monkeypatch):
     scene = scene_with(CPU, fine, (fine, (0.01, 0.02, 0, 0, 0, 0.01, 1)))
     with testing.regime(plain_tests=10**9):
         expected = ab.Query(scene, "faces", pairs=[(0, 1)]).run()
+    least = descent.slab_memory_words(0)
     with testing.regime(plain_tests=0):
         query = ab.Query(scene, "faces", pairs=[(0, 1)])
         found = [query.run().faces]
-        assert query.traversal.slab_memory.shape[1] > slab_memory_words(0), "more subtrees than slots"
-        monkeypatch.setattr(descent, "slab_memory_words", lambda depth: slab_memory_words(0))
+        assert query.traversal.slab_memory.shape[1] > least, "more subtrees than slots"
+        monkeypatch.setattr(descent, "slab_memory_words", lambda depth: least)
         query = ab.Query(scene, "faces", pairs=[(0, 1)])
-        assert query.traversal.slab_memory.shape[1] == slab_memory_words(0)
+        assert query.traversal.slab_memory.shape[1] == least
         found.append(query.run().faces)
     for faces in found:
         np.testing.assert_array_equal(faces, expected.faces)
@@ -135,13 +128,13 @@ def list_leaf_pairs_kernel(
     """Note which faces of one number are a leaf pair that slabs do not separate, from the roots on."""
     pose = pair_poses[0]
     pose.margin = pose.margin * margin_factor
-    state = Descent()
+    state = descent.Descent()
     state.ready = AT_ONCE
     state.deep = 1
-    open_subtrees(models, states, pose, state, memory)
+    descent.open_subtrees(models, states, pose, state, memory)
     stack_inout[0] = first_item(states, pose)
     while state.deep > 0:
-        for i in range(descend_subtrees(models, states, pose, state, stack_inout, memory, faces_inout)):
+        for i in range(descent.descend_subtrees(models, states, pose, state, stack_inout, memory, faces_inout)):
             if item_first(faces_inout[i]) == item_second(faces_inout[i]):
                 met_out[item_first(faces_inout[i])] = 1
 
@@ -161,8 +154,9 @@ def touching_soups(rng, count, reach):
 
 def count_lost(query, count, margin_factor):
     """Return how many of the pairs that share a corner slabs separate."""
-    memory = wp.zeros((1, slab_memory_words(0)), dtype=wp.float32, device=CPU)
-    buffers = [wp.empty(length, dtype=wp.int64, device=CPU) for length in (CPU_STACK_LENGTH, WAITING_LENGTH)]
+    memory = wp.zeros((1, descent.slab_memory_words(0)), dtype=wp.float32, device=CPU)
+    lengths = descent.CPU_STACK_LENGTH, descent.WAITING_LENGTH
+    buffers = [wp.empty(length, dtype=wp.int64, device=CPU) for length in lengths]
     met = wp.zeros(count, dtype=wp.int32, device=CPU)
     inputs = [margin_factor, query.batch.models.pool, query.batch.states.pool, query.pair_poses, memory, *buffers, met]
     wp.launch(list_leaf_pairs_kernel, dim=1, inputs=inputs, device=CPU)

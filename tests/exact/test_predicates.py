@@ -30,9 +30,8 @@ def words_kernel(a: wp.array[wp.float64], b: wp.array[wp.float64], words_out: wp
     """High and low word of a sum, of a product, and of a sum that invites contraction with the product in it."""
     i, zero = wp.tid(), wp.float64(0.0)
     for k in range(3):
-        words = add_double(
-            wp.vec2d(wp.where(k == 0, a[i], a[i] * b[i]), zero), wp.vec2d(wp.where(k == 0, b[i], a[i]), zero)
-        )
+        first, second = wp.where(k == 0, a[i], a[i] * b[i]), wp.where(k == 0, b[i], a[i])
+        words = add_double(wp.vec2d(first, zero), wp.vec2d(second, zero))
         if k == 1:
             high, low = two_product(a[i], b[i])
             words = wp.vec2d(high, low)

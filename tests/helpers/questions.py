@@ -31,9 +31,8 @@ def launch(kernel, device, shape, *inputs, columns=0, block_dim=256):
     """
     types, given = [argument.type for argument in kernel.adj.args], []
     for value, kind in zip(inputs, types):
-        given.append(
-            wp.array(value, dtype=kind.dtype, device=device) if isinstance(value, (list, np.ndarray)) else value
-        )
+        is_host = isinstance(value, (list, np.ndarray))
+        given.append(wp.array(value, dtype=kind.dtype, device=device) if is_host else value)
     out = wp.zeros((shape, columns) if columns else shape, dtype=types[-1].dtype, device=device)
     wp.launch(kernel, shape, [*given, out], device=device, block_dim=block_dim)
     return out.numpy()

@@ -133,11 +133,9 @@ def test_distances_end_at_a_bound(device, within):
     corners = corners_of(model)
     points = np.concatenate([rng.uniform(-1.2, 1.2, (400, 3)), corners[:9, 0]])
     for signed in (True, False):
-        whole, part = (
-            ab.signed_distance(model, points, device=device, signed=signed, nearest=True, within=bound)
-            for bound in (None, within)
-        )
-        check_within(whole, part, within)
+        options = {"device": device, "signed": signed, "nearest": True}
+        whole = ab.signed_distance(model, points, **options)
+        check_within(whole, ab.signed_distance(model, points, **options, within=within), within)
 
 
 def placed_objects(rng, device):
@@ -235,9 +233,8 @@ def test_points_of_a_gpu_stay_there():
     assert scene.signed_distance(rows)[0].numpy().tobytes() == host[0].tobytes()
     none = wp.empty(0, dtype=wp.vec3d, device="cuda:0")
     assert ab.signed_distance(model, none).shape == (0,)
-    refused(
-        ValueError, "points: on cuda:0, the model or scene is on cpu", ab.signed_distance, model, rows, device="cpu"
-    )
+    elsewhere = "points: on cuda:0, the model or scene is on cpu"
+    refused(ValueError, elsewhere, ab.signed_distance, model, rows, device="cpu")
     for bad, what in ((np.nan, "is not finite"), (-np.inf, "is not finite"), (1e160, "has a coordinate beyond")):
         points[[40_000, 60_000], 1] = bad
         rows = wp.array(points, dtype=wp.vec3d, device="cuda:0")

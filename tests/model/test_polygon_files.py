@@ -46,9 +46,8 @@ INPUT = '<input semantic="VERTEX" source="#v" offset="0"/>'
 def ply(points, faces, order="", kind="int", length="uchar"):
     """Return a PLY file with more columns than are needed, in text ("") or binary ("<", ">")."""
     name = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
-    data = (
-        f"ply\nformat {name} 1.0\ncomment by hand\nelement vertex {len(points)}\nproperty float x\nproperty double y\n"
-    )
+    data = f"ply\nformat {name} 1.0\ncomment by hand\nelement vertex {len(points)}\n"
+    data += "property float x\nproperty double y\n"
     data += f"property float z\nproperty uchar red\nelement face {len(faces)}\nproperty uchar flag\n"
     data += f"property list {length} {kind} vertex_indices\nproperty list uchar float texcoord\nend_header\n"
     if order == "":

@@ -53,11 +53,11 @@ def test_times_are_never_late(device):
     starts, ends = over(len(n), 1.0), over(len(n), 1.0)
     ends[:, 3:, 2] -= n[:, None]
     time, end = find(device, starts, ends)
-    assert (end == int(TOUCHES)).all() and (
-        np.array([1 / k for k in n]) > [Fraction(1, int(k)) for k in n]
-    ).mean() > 0.3
-    for t, k in zip(time.tolist(), n.tolist()):
-        assert Fraction(1, k) * (1 - Fraction(1, 2**50)) <= Fraction(t) <= Fraction(1, k)
+    assert (end == int(TOUCHES)).all()
+    truth = [Fraction(1, k) for k in n.tolist()]
+    assert np.mean([1 / k > exact for k, exact in zip(n.tolist(), truth)]) > 0.3
+    for t, exact in zip(time.tolist(), truth):
+        assert exact * (1 - Fraction(1, 2**50)) <= Fraction(t) <= exact
 
 
 @pytest.mark.parametrize("height", [1.0, 2.0**-30, 2.0**-60])

@@ -39,10 +39,8 @@ def last_touch(resting, moving, direction) -> float:
     frame[:, 2] = direction
     a, b = resting @ frame, moving @ frame
     mirrored = [1, 1, -1]
-    found = [
-        _corners_over(b.reshape(-1, 3), a).max(),
-        _corners_over(a.reshape(-1, 3) * mirrored, b * mirrored).max(),
-    ]
+    found = [_corners_over(b.reshape(-1, 3), a).max()]
+    found.append(_corners_over(a.reshape(-1, 3) * mirrored, b * mirrored).max())
     found += [_edges_over(b[:, i], b[:, j], a[:, k], a[:, m]).max() for i, j in EDGE for k, m in EDGE]
     return max(found)
 

@@ -21,9 +21,8 @@ def lattice_points(rng, dim):
 
 def coplanar_points(rng, dim, size=1.0):
     """The last point on the plane or line of the others, up to rounding and two units in the last place."""
-    points = rng.normal(size=(COUNT, dim + 1, dim)) + 2.0 ** rng.integers(-3, 20, (COUNT, 1, 1)) * rng.normal(
-        size=(COUNT, 1, dim)
-    )
+    far = 2.0 ** rng.integers(-3, 20, (COUNT, 1, 1)) * rng.normal(size=(COUNT, 1, dim))
+    points = rng.normal(size=(COUNT, dim + 1, dim)) + far
     weight = rng.choice([0.0, 0.25, 0.5, 1.0, -1.0, 0.3], (COUNT, dim - 1, 1))
     points[:, dim] = points[:, 0] + (weight * (points[:, 1:dim] - points[:, :1])).sum(1)
     points = size * (points + rng.integers(-2, 3, points.shape) * np.spacing(np.abs(points)))

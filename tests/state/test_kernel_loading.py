@@ -87,9 +87,7 @@ def compile_ahead(monkeypatch, device, cores, kernels, number):
     found, force_load, compile_module = [], wp.force_load, wp.compile_aot_module
     monkeypatch.setattr(kernel_loading, "core_count", lambda: cores)
     monkeypatch.setattr(kernel_loading, "_first_query", [lambda device, face_counts: kernels])
-    monkeypatch.setattr(
-        wp, "force_load", lambda device, modules, *given: found.append(force_load(device, modules, *given))
-    )
+    monkeypatch.setattr(wp, "force_load", lambda *given: found.append(force_load(*given)))
     monkeypatch.setattr(wp, "compile_aot_module", lambda *given: found.append(compile_module(*given)))
     end = time.monotonic() + 60
     with wp.ScopedDevice(device), kernel_loading.compiling_ahead(1):

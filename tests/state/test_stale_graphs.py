@@ -125,12 +125,8 @@ def test_a_graph_keeps_its_arrays(device):
     replay, states, objects = captured(query), query.batch.states.pool, query.batch.objects.pool
     kept = [query.hits.face, query.hits.any_hit, query.pair_poses, query.pairs, query.traversal.work.counter]
     kept += [states.node_box, states.face_corner, states.lod, objects.state, objects.rotation]
-    kept += [
-        query.broad_phase.lower,
-        query.broad_phase.filter.excluded,
-        query.broad_phase.filter.group,
-        query.guard.launched,
-    ]
+    found = query.broad_phase
+    kept += [found.lower, found.filter.excluded, found.filter.group, query.guard.launched]
     alive = [weakref.ref(array) for array in kept]
     query.run()
     known, ids = objects.state, objects.state.numpy().tolist()
@@ -138,7 +134,7 @@ def test_a_graph_keeps_its_arrays(device):
     assert known.numpy().tolist() == ids, "the states of the pool that the graph knows, and no others"
     del known
     scene.add(sample("box"))
-    del kept, states, objects
+    del kept, states, objects, found
     gc.collect()
     assert all(reference() is not None for reference in alive)
     replay()
