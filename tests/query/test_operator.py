@@ -72,16 +72,12 @@ class TouchingStage(Stage):
 
 
 @pytest.mark.parametrize("scene", [None, "cpu", ab.Scene])
-@pytest.mark.parametrize(
-    "make",
-    [
-        *(ab.Query, ab.ContactQuery, ab.ManifoldQuery, ab.DistanceQuery),
-        lambda scene: ab.FirstContactQuery(scene, None),
-        lambda scene: FaceQuery(scene, visit_least, LeastDistance()),
-    ],
-)
-def test_refuses_what_is_no_scene(make, scene):
-    refused(TypeError, f"scene: a Scene or Batch is expected, not a {type(scene).__name__}$", make, scene)
+def test_refuses_what_is_no_scene(scene):
+    makers = [ab.Query, ab.ContactQuery, ab.ManifoldQuery, ab.DistanceQuery]
+    makers.append(lambda scene: ab.FirstContactQuery(scene, None))
+    makers.append(lambda scene: FaceQuery(scene, visit_least, LeastDistance()))
+    for make in makers:
+        refused(TypeError, f"scene: a Scene or Batch is expected, not a {type(scene).__name__}$", make, scene)
 
 
 @pytest.mark.parametrize("pairs", [None, MORE_PAIRS])
@@ -284,9 +280,10 @@ def test_takes_what_returns_on_all_ways(device, visit, hits):
     assert query.run().any.tolist() == hits
 
 
-@pytest.mark.parametrize(
-    ("visit", "own", "message"),
-    [
+def test_refuses_what_cannot_be_called():
+    box = ab.Model.load(trimesh.creation.box())
+    scene = scene_with("cpu", box, box)
+    for visit, own, message in (
         (visit_without_value, LeastDistance(), "visit_without_value: ends without a value; return a bool"),
         (visit_half, LeastDistance(), "visit_half: ends without a value"),
         (visit_none, LeastDistance(), "visit_none: ends without a value"),
@@ -297,8 +294,5 @@ def test_takes_what_returns_on_all_ways(device, visit, hits):
         (visit_least, Trees(), "visit_least: own is a .*LeastDistance, given is a .*Trees"),
         (visit_least, LeastDistance, "own: an instance of a Warp struct is expected, not a Struct"),
         (visit_least, None, "own: an instance of a Warp struct is expected, not a NoneType"),
-    ],
-)
-def test_refuses_what_cannot_be_called(visit, own, message):
-    box = ab.Model.load(trimesh.creation.box())
-    refused(TypeError, message, FaceQuery, scene_with("cpu", box, box), visit, own, [(0, 1)])
+    ):
+        refused(TypeError, message, FaceQuery, scene, visit, own, [(0, 1)])
