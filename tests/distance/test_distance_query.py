@@ -286,25 +286,21 @@ def make_turns(rng, device, count):
     return scene_of(device, cases), turns
 
 
-@pytest.mark.parametrize("warps", [True, False])
-def test_a_graph_answers_what_is_in_place(device, warps):
+def test_a_graph_answers_what_is_in_place(device, regime):
     """Captured before there was a launch; and calls one after the other, from the fourth on a graph on a GPU."""
     scene, turns = make_turns(np.random.default_rng(15), device, 8)
-    if scene.device.is_cuda and not warps:
-        pytest.skip("CUDA has warps alone")
     met = []
-    with testing.regime(warps=warps):
-        first, called = (ab.DistanceQuery(scene, turns[0][1][::-1]) for _ in range(2))
-        replay = captured(first)
-        for poses, pairs in turns:
-            scene.set_poses(poses)
-            expected = ab.DistanceQuery(scene, pairs).run()
-            for query in (first, called):
-                query.set_pairs(pairs)
-            replay()
-            assert to_bytes(first.result()) == to_bytes(expected)
-            assert to_bytes(called.run()) == to_bytes(expected)
-            met.append(expected.any.mean())
+    first, called = (ab.DistanceQuery(scene, turns[0][1][::-1]) for _ in range(2))
+    replay = captured(first)
+    for poses, pairs in turns:
+        scene.set_poses(poses)
+        expected = ab.DistanceQuery(scene, pairs).run()
+        for query in (first, called):
+            query.set_pairs(pairs)
+        replay()
+        assert to_bytes(first.result()) == to_bytes(expected)
+        assert to_bytes(called.run()) == to_bytes(expected)
+        met.append(expected.any.mean())
     assert 0.2 < np.mean(met) < 0.8
     scene.set_lods(np.maximum(scene.lods - np.arange(scene.object_count) % 5, 0))  # more states than there were
     replay()

@@ -115,7 +115,7 @@ def test_very_many_nearly_equally_near_faces(device, roughness, far):
 
 
 @pytest.mark.parametrize("case", [0, 1], ids=["warps", "threads"])
-def test_margins_of_slabs_cover_roundings_that_add_up(device, case):
+def test_margins_of_slabs_cover_roundings_that_add_up(device, regime, case):
     """Beside its mirror image in the origin each face is one of two, so that slabs of nodes are compared."""
     rows = ROUNDED.strip().split("\n\n")[case].split("\n")
     *corners, quaternion, apart = (np.array(row.split(), float) for row in rows)
@@ -126,14 +126,12 @@ def test_margins_of_slabs_cover_roundings_that_add_up(device, case):
     scene = scene_of(device, [(a, None, STILL, b, None, pose)])
     pairs = [(0, 1)] * int(PAIRS_LEAST)
     distance = mesh_distance(a, a.lod_max, STILL, b, b.lod_max, pose)
-    for warps in (None, True):
-        with testing.regime(warps=warps):
-            query = ab.DistanceQuery(scene, pairs, beyond=distance * (1 + 1e-9))
-            query.run()
-            query.forget()
-            found = query.run()
-            assert (query.stages[-1].slabs.made.numpy()[:, 0] >= 0).sum() == 2
-        np.testing.assert_allclose(found.distance, distance, rtol=1e-6)
+    query = ab.DistanceQuery(scene, pairs, beyond=distance * (1 + 1e-9))
+    query.run()
+    query.forget()
+    found = query.run()
+    assert (query.stages[-1].slabs.made.numpy()[:, 0] >= 0).sum() == 2
+    np.testing.assert_allclose(found.distance, distance, rtol=1e-6)
 
 
 def beside_one_another(rng, length=3000.0, reach=1e-2):
@@ -153,20 +151,18 @@ def beside_one_another(rng, length=3000.0, reach=1e-2):
     return a, a.lod_max, STILL, b, b.lod_max, to_matrix(turn, length * rod + way)
 
 
-@pytest.mark.parametrize("warps", [None, True], ids=["threads", "warps"])
-def test_margins_of_balls_cover_roundings(device, warps):
+def test_margins_of_balls_cover_roundings(device, regime):
     """Nodes that are apart across the direction in which slabs are compared; without the margin some are lost."""
     rng = np.random.default_rng(0)
     cases = [beside_one_another(rng) for _ in range(40)]
     truths = np.tile([mesh_distance(*case) for case in cases], int(USES_MIN) + 1)
     pairs = np.tile(pairs_of(cases), (int(USES_MIN) + 1, 1))
-    with testing.regime(warps=warps):
-        query = ab.DistanceQuery(scene_of(device, cases), pairs, beyond=truths * (1 + 1e-9))
-        for _ in range(2):
-            query.run()
-            query.forget()
-        assert (query.stages[-1].slabs.made.numpy()[:, 0] >= 0).sum() == 2 * len(cases)
-        np.testing.assert_allclose(query.run().distance, truths, rtol=1e-6)
+    query = ab.DistanceQuery(scene_of(device, cases), pairs, beyond=truths * (1 + 1e-9))
+    for _ in range(2):
+        query.run()
+        query.forget()
+    assert (query.stages[-1].slabs.made.numpy()[:, 0] >= 0).sum() == 2 * len(cases)
+    np.testing.assert_allclose(query.run().distance, truths, rtol=1e-6)
 
 
 def test_slabs_leave_off_what_roundings_add_up_to():

@@ -173,24 +173,19 @@ def sampled():
     return runpy.run_path(str(SAMPLE))
 
 
-@pytest.fixture(params=[True, False], ids=["warps", "threads"])
-def scene_and_meshes(request, device):
-    """Give a plate and a ball that crosses it, one beside it and one far away, turned."""
-    if wp.get_device(device).is_cuda and not request.param:
-        pytest.skip("CUDA has warps alone")
+@pytest.fixture
+def scene_and_meshes(regime, device):
+    """Return a plate and a ball that crosses it, one beside it and one far away, turned."""
     plate = trimesh.creation.box((2.0, 1.0, 0.1)).subdivide()
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.4)
-    rng, scene = np.random.default_rng(3), ab.Scene(device=device)
-    poses = np.zeros((4, 7))
+    rng, poses = np.random.default_rng(3), np.zeros((4, 7))
     poses[1:, :3] = (0.1, 0, 0.3), (-0.5, 0.2, 0.5), (0, 0, 3)
     poses[:, 3:] = rng.normal(size=(4, 4))
     poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1)[:, None]
     turn = trimesh.transformations.quaternion_matrix(poses[0, [6, 3, 4, 5]])[:3, :3]
     poses[:, :3] = poses[:, :3] @ turn.T
-    for mesh, pose in zip((plate, ball, ball, ball), poses, strict=True):
-        scene.add(ab.Model.load(mesh), pose=pose)
-    with testing.regime(warps=request.param):
-        yield scene, plate, ball, poses
+    models = map(ab.Model.load, (plate, ball, ball, ball))
+    return scene_with(device, *zip(models, poses, strict=True)), plate, ball, poses
 
 
 @pytest.mark.parametrize("distance", [0.0, 0.05, 0.2])

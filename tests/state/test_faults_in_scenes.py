@@ -10,12 +10,11 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import warp as wp
-from conftest import slow, slow_rows
+from conftest import ROOT, slow, slow_rows
 from helpers import faults, scenes
 from helpers.faults import MORE_PAIRS, PAIRS, add_objects, check_scene, describe, make_scene
 from helpers.samples import random_poses, sample
@@ -217,9 +216,8 @@ print(status, ask(device) == expected)
 
 def run(*devices):
     """Return what a forked child says that asks on the other device, and then its parent."""
-    path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")])
-    options = {"capture_output": True, "text": True, "timeout": 300, "env": {**os.environ, "PYTHONPATH": path}}
-    done = subprocess.run([sys.executable, "-c", FORK, *devices], **options)
+    command = [sys.executable, "-c", FORK, *devices]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 
