@@ -295,7 +295,7 @@ def test_integers_leave_what_128_bits_may_not_hold(device, form):
 
 
 @pytest.mark.parametrize("form", ["2D", "3D"])
-def test_integers_wrap(device, form):
+def test_integers_wrap_and_leave_what_is_no_number(device, form):
     """2^e m - 1 and 2^64 over 2^(e - 64) m - 1 and 1: 2^64 - 1, whatever of the first is beyond 128 bits."""
     dim, _ = FORMS[form]
     exponents = np.arange(64, 200)
@@ -306,11 +306,6 @@ def test_integers_wrap(device, form):
         points[:, 2] = 1.0, 0.0, 1.0
     found = ask(device, form, points, np.full(len(points), 2.0**62))["integer"]
     assert (found == 1).all() and (true_signs(points) == 1).all()
-
-
-@pytest.mark.parametrize("form", ["2D", "3D"])
-def test_integers_leave_what_is_no_number(device, form):
-    dim, _ = FORMS[form]
     points = np.tile(np.eye(dim + 1, dim), (4, 1, 1))
     points[1, 0, 0], points[2, dim, 1] = np.nan, np.inf
     found = ask(device, form, points, np.array([1.0, 1.0, 1.0, np.inf]))["integer"]

@@ -207,8 +207,6 @@ def test_nothing_is_made_without_solids(device):
 
 
 def test_captured_queries_and_pipelines_see_new_lods_and_poses(device):
-    if device != "cpu" and not wp.is_mempool_enabled(device):
-        pytest.skip("capturing needs memory pools")
     rng = np.random.default_rng(5)
     scene = ab.Scene(device)
     for i in range(12):

@@ -5,7 +5,6 @@ from functools import partial
 import numpy as np
 import pytest
 import trimesh
-import warp as wp
 from helpers import refused
 from helpers.bodies import about
 from helpers.questions import captured
@@ -153,8 +152,6 @@ def test_sweeps_and_captured_queries(device):
     np.testing.assert_array_equal(plain["distance"], np.maximum(found["distance"], 0))
     refused(ValueError, "signed 1 is neither", ab.sweep, BOX, BALL, poses, output="distance", device=device, signed=1)
     refused(ValueError, "signed means nothing", ab.sweep, BOX, BALL, poses, output="any", device=device, signed=True)
-    if device != "cpu" and not wp.is_mempool_enabled(device):
-        return
     scene = scene_with(device, BOX, (BALL, poses[0]), solid=True)
     query = ab.DistanceQuery(scene, np.array([(0, 1)]), signed=True)
     replay = captured(query)

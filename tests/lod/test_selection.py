@@ -218,13 +218,21 @@ def see(camera, point):
     return math.dist(point, camera.eye), place
 
 
-def test_camera_looks_where_it_is_told():
+def test_cameras_look_where_they_are_told_and_keep_up_upwards():
     camera = Camera.look_at((0, 0, 5), (0, 0, 0), size=(200, 100), field_of_view=math.pi / 2)
     assert np.array_equal(camera.view, np.eye(3))
     assert np.allclose(see(camera, (1, 2, 0))[1], [10, 20])
     tilted = Camera.look_at((3, 1, -2), (0, 2, 7), up=(0.1, 1, 0))
     assert np.allclose(tilted.view @ (np.array([0, 2, 7]) - [3, 1, -2]), [0, 0, -math.sqrt(91)])
     assert (tilted.view @ [0.1, 1, 0])[1] > 0
+    for eye, up, row in (
+        ((5, 0, 0), None, (0, 0, 1)),
+        ((5, 0, 5), None, (-(0.5**0.5), 0, 0.5**0.5)),
+        ((0, 0, -5), None, (0, 1, 0)),  # along z
+        ((5, 0, 0), "-y", (0, -1, 0)),
+        ((0, 0, 5), (9, 0, 0), (1, 0, 0)),
+    ):
+        assert np.allclose(Camera.look_at(eye, (0, 0, 0), up).view[1], row), eye
 
 
 def test_cameras_refuse():
@@ -247,17 +255,6 @@ def test_cameras_refuse():
         ((0, 3, 1), (0, 0, 0), "up: a direction of no length"),
     ):
         refused(ValueError, what, Camera.look_at, (0, 0, 1), target, up)
-
-
-def test_up_is_upwards_on_the_screen():
-    for eye, up, row in (
-        ((5, 0, 0), None, (0, 0, 1)),
-        ((5, 0, 5), None, (-(0.5**0.5), 0, 0.5**0.5)),
-        ((0, 0, -5), None, (0, 1, 0)),  # along z
-        ((5, 0, 0), "-y", (0, -1, 0)),
-        ((0, 0, 5), (9, 0, 0), (1, 0, 0)),
-    ):
-        assert np.allclose(Camera.look_at(eye, (0, 0, 0), up).view[1], row), eye
 
 
 def test_view_measures_distance_motion_and_focus(device):

@@ -117,12 +117,9 @@ def test_options_and_other_contents_build_anew(folder, built, ball):
     trimesh.creation.icosphere(3, radius=2.0).export(ball)
     assert np.ptp(ab.Model.load(ball).mesh_at(0)[0]) > 2.0
     assert len(built) == 3 == len(list(folder.iterdir()))
-
-
-def test_arrays_and_meshes_are_found_by_what_they_hold(folder, built):
-    ball = trimesh.creation.icosphere(3)
-    models = [ab.Model.from_arrays(ball.vertices, ball.faces, name="a"), ab.Model.load(ball)]
-    assert len(built) == 1 and models[0].digest == models[1].digest
+    mesh = trimesh.creation.icosphere(3, radius=3.0)  # found by what it holds
+    models = [ab.Model.from_arrays(mesh.vertices, mesh.faces, name="a"), ab.Model.load(mesh)]
+    assert len(built) == 4 and models[0].digest == models[1].digest
     assert [model.name for model in models] == ["a", "trimesh"]
 
 

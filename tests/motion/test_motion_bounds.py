@@ -212,8 +212,13 @@ def errors_of(case):
 @pytest.mark.parametrize("screw", [False, True], ids=["straight", "screw"])
 @pytest.mark.parametrize("name", FAMILIES)
 def test_slacks_of_faces_cover_the_rounding_of_paths(device, name, screw):
-    """Half of the slack of points is for those, half for what rounding of a slow turn adds to speeds."""
+    """Half of the slack of points is for those, half for what rounding of a slow turn adds to speeds.
+
+    Accelerations are bounded, too.
+    """
     case = family(np.random.default_rng(1), device, name, screw)
+    for points, (_, _, bend), _, _, most, *_ in case.views():
+        assert (2 * case.motion["scale"] * farthest(move(bend, points)) <= most).all()
     for off, _, slack, _ in errors_of(case):
         assert (off <= 0.5 * slack).all() and (off > 0).any()
     case.find_truth(case.own_turns)
@@ -255,14 +260,6 @@ def test_margins_of_boxes_cover_float32(device, name, straight):
         left = np.minimum(low - (middle - width.astype(float)), (middle + width.astype(float)) - high)
         assert (left >= 0).all()
         assert (left.min(1) < 2 * margin).any(), "without the margin it is too narrow"
-
-
-@pytest.mark.parametrize("name", ["plain", "far from the origin", "tiny"])
-def test_accelerations_are_bounded(device, name):
-    case = family(np.random.default_rng(4), device, name)
-    scale = 2 * case.motion["scale"]
-    for points, (_, _, bend), _, _, most, *_ in case.views():
-        assert (scale * farthest(move(bend, points)) <= most).all()
 
 
 def plates(rng, way, turns):
