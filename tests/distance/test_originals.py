@@ -16,12 +16,12 @@ SAMPLES = ("torus", "ball", "capsule", "soup", "cow")
 CLOSE = 1 + 1e-12
 
 
-def random_cases(rng, count, names=SAMPLES, spread=2.5):
+def random_cases(rng, count):
     """Return cases of samples at random LODs, some at their finest, and poses, from crossing to far apart."""
     cases = []
     for _ in range(count):
-        a, b = (sample(rng.choice(names)) for _ in range(2))
-        pose_a, pose_b = random_poses(rng, 2, spread)
+        a, b = (sample(rng.choice(SAMPLES)) for _ in range(2))
+        pose_a, pose_b = random_poses(rng, 2, 2.5)
         whole = rng.random() < 0.2
         lod_a, lod_b = (model.lod_max if whole else random_lod(rng, model, 2000) for model in (a, b))
         cases.append((a, lod_a, pose_a, b, lod_b, pose_b))

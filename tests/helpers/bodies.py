@@ -7,6 +7,7 @@ import trimesh
 import warp as wp
 
 import warp_abtree as ab
+from helpers.scenes import scene_with
 
 FLOOR = (0, 0, -0.5, 0, 0, 0, 1)
 
@@ -48,19 +49,17 @@ def about(axis, angle):
 
 def make(device, *placed, world=0, **options):
     """Return the dynamics of (model, pose) or (model, pose, static)."""
-    scene = ab.Scene(device)
-    for model, pose, *static in placed:
-        scene.add(model, pose=pose, static=bool(static and static[0]), world=world)
-    return ab.Dynamics(scene, **options)
+    objects = [(model, pose, {"static": bool(static and static[0])}) for model, pose, *static in placed]
+    return ab.Dynamics(scene_with(device, *objects, world=world), **options)
 
 
 def on_ground(device, *placed, **options):
     return make(device, (GROUND, FLOOR, True), *placed, **options)
 
 
-def heap(device, count=7, **options):
-    """Return rigid bodies that fall onto each other."""
-    poses = [(0.1 * i, 0.05 * i, 0.6 + 0.55 * i, 0, 0, 0, 1) for i in range(count)]
+def heap(device, **options):
+    """Return seven rigid bodies that fall onto each other."""
+    poses = [(0.1 * i, 0.05 * i, 0.6 + 0.55 * i, 0, 0, 0, 1) for i in range(7)]
     return on_ground(device, *(((BRICK, TORUS, BALL)[i % 3], pose) for i, pose in enumerate(poses)), **options)
 
 
@@ -91,8 +90,7 @@ def selection_models():
 
 def strewn(count, device):
     """Return a scene with objects of all `selection_models` and importances at random places."""
-    rng, models = np.random.default_rng(0), selection_models()
-    scene = ab.Scene(device=device)
+    rng, models, scene = np.random.default_rng(0), selection_models(), ab.Scene(device)
     for i in range(count):
         turn = rng.normal(size=4)
         pose = np.concatenate([rng.uniform(-4, 4, 3), turn / np.linalg.norm(turn)])
@@ -106,8 +104,8 @@ def newton_mesh(shape):
     return newton.Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces, np.int32).ravel())
 
 
-def at(x=0.0, y=0.0, z=0.0, axis=(0, 0, 1), angle=0.0):
-    return wp.transform((x, y, z), about(axis, angle))
+def at(x=0.0, y=0.0, z=0.0, angle=0.0):
+    return wp.transform((x, y, z), about((0, 0, 1), angle))
 
 
 def collided(model, **options):
@@ -148,12 +146,12 @@ class PairContacts:
             wp.copy(getattr(contacts, f"rigid_contact_shape{side}"), shapes)
 
 
-def settle(model, found, steps, iterations=2):
+def settle(model, found, steps):
     """Step bodies by a solver of Newton's; return their poses and the last contacts."""
     import newton
 
     state, after, control, contacts = model.state(), model.state(), model.control(), found.contacts()
-    solver = newton.solvers.SolverXPBD(model, iterations=iterations)
+    solver = newton.solvers.SolverXPBD(model, iterations=2)
     for _ in range(steps):
         state.clear_forces()
         found.collide(state, contacts)

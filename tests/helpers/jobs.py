@@ -2,8 +2,8 @@
 
 import numpy as np
 
-import warp_abtree as ab
 from helpers.samples import STILL, random_poses, sample
+from helpers.scenes import scene_with
 from warp_abtree.jobs import SweepJob, ThisProcess, read_shards, run_shards
 
 MODELS = ("torus", "small ball")
@@ -17,8 +17,8 @@ def poses_of(count=100, seed=0):
     return random_poses(np.random.default_rng(seed), count, 1.6)
 
 
-def lods_of(count, seed=1):
-    rng = np.random.default_rng(seed)
+def lods_of(count):
+    rng = np.random.default_rng(1)
     return np.stack([rng.integers(0, model.lod_max + 1, count) for model in pair()], 1)
 
 
@@ -47,10 +47,10 @@ def shard_at(out, k):
 
 def intersect(device, poses, lods, output):
     """Return the result of a scene with two objects per pose, whose index is the pair's."""
-    scene = ab.Scene(device)
-    for k, model in enumerate(pair()):
-        for i in range(len(poses)):
-            scene.add(model, poses[i] if k else STILL, lod=int(lods[i, k]))
+    first, second = pair()
+    objects = [(first, STILL, {"lod": int(lod)}) for lod in lods[:, 0]]
+    objects += [(second, pose, {"lod": int(lod)}) for pose, lod in zip(poses, lods[:, 1])]
+    scene = scene_with(device, *objects)
     return scene.intersect(np.arange(len(poses))[:, None] + [0, len(poses)], output=output)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 import warp_abtree as ab
+from helpers.questions import QUARTERS, to_matrix
 from helpers.scenes import scene_with
 
 # The two triangles of a unit square's sides, by corners of the cube in binary, outwards.
@@ -35,23 +36,13 @@ def voxel_mesh(cells, rng=None):
     return np.array(list(corners), float), faces if rng is None else faces[rng.permutation(len(faces))]
 
 
-def shell(size, wall=1):
-    grid = np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    return grid[((grid < wall) | (grid >= size - wall)).any(1)]
+def shell(size):
+    grid = np.indices((size, size, size)).reshape(3, -1).T
+    return grid[((grid == 0) | (grid == size - 1)).any(1)]
 
 
-def lattice_rotation(rng):
-    """Return one of the 24 rotations of a cube, (3, 3)."""
-    while True:
-        matrix = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)[:, None]
-        if np.linalg.det(matrix) > 0:
-            return matrix
-
-
-def lattice_pose(rng, reach, scale=1.0):
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = lattice_rotation(rng), rng.integers(-reach, reach + 1, 3) * scale
-    return pose
+def lattice_pose(rng, reach):
+    return to_matrix(QUARTERS[rng.integers(len(QUARTERS))], rng.integers(-reach, reach + 1, 3))
 
 
 def model_of(mesh, name="voxels"):

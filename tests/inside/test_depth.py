@@ -38,7 +38,7 @@ def greatest_depth(points, outer):
     return next((depths[k] for k in np.argsort(-depths) if depths[k] > 1e-12 and parity(points[k], outer)), 0.0)
 
 
-def check_row(result, row, meshes, poses, solid, tolerance=1e-12):
+def check_row(result, row, meshes, poses, solid):
     """Compare one pair that intersects with brute force, and its witnesses with the meshes; return the depth."""
     a, b = sorted(result.pairs[row].tolist())
     other = into_frame_of_a(meshes[b][0], poses[a], poses[b])[meshes[b][1]]
@@ -46,7 +46,7 @@ def check_row(result, row, meshes, poses, solid, tolerance=1e-12):
     depths = [greatest_depth(samples(own), other), greatest_depth(samples(other), own)]
     expected = max(depths[0] * solid[b], depths[1] * solid[a])
     depth = -result.distance[row]
-    assert abs(depth - expected) <= tolerance
+    assert abs(depth - expected) <= 1e-12
     if depth > 0:
         lower, upper = result.bracket[row]
         assert lower <= -expected <= upper and upper - lower < 1e-11
@@ -129,7 +129,7 @@ def test_lattice_bodies(device):
     """Samples on edges, corners and planes of the other."""
     rng = np.random.default_rng(11)
     deep = 0
-    for _ in range(40):
+    for _ in range(60):
         bodies = [voxel_mesh(rng.integers(0, 3, (8, 3)), rng) for _ in range(2)]
         poses = lattice_pose(rng, 1), lattice_pose(rng, 1)
         models = [model_of((vertices * (1, 0.5)[k], faces)) for k, (vertices, faces) in enumerate(bodies)]
