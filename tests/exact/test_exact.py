@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import trimesh
 from helpers import refused
 from helpers.questions import QUARTERS, ask, coarse, sort_rows, to_matrix
 from helpers.samples import SHAPES, STILL, contact_poses, model_of_faces, random_poses, sample, true_faces
@@ -48,10 +49,7 @@ def posed():
 def split(name):
     """Return a lattice mesh with each face cut in four at the middles of its edges; face f becomes 4 f .. 4 f + 3."""
     vertices, faces, _ = lattice_mesh(name)
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    ab_, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    parts = np.stack([np.stack(t, 1) for t in ((a, ab_, ca), (ab_, b, bc), (ca, bc, c), (bc, ca, ab_))], 1)
-    return model_of_faces(parts.reshape(-1, 3, 3), base_faces=10**6)
+    return ab.Model.from_arrays(*trimesh.remesh.subdivide(vertices, faces), base_faces=10**6)
 
 
 def shuffle(rng, name):

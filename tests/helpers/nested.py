@@ -1,6 +1,7 @@
 """Surfaces inside one another, near or touching; and specks nearer to a large object than coordinates round."""
 
 import numpy as np
+import trimesh
 from oracles.triangle import into_frame_of_a, quaternion_matrix
 from oracles.triangle_distance import triangle_distance
 
@@ -13,16 +14,10 @@ STEP = 2.0**-23  # of float32 from 1 to 2
 def shells(rng, gap):
     """Return two models of a rippled torus, the second farther inside by about a gap, which is random."""
     model = sample("torus")
-    vertices, faces, _ = model.mesh_at(model.lod_max)
-    corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inwards = np.zeros_like(vertices)
-    for k in range(3):
-        np.subtract.at(inwards, faces[:, k], normals)
-    inwards /= np.linalg.norm(inwards, axis=1, keepdims=True)
-    rippled = vertices + 0.02 * np.sin(9 * vertices[:, [1, 2, 0]])
-    inside = rippled + gap * rng.uniform(0.2, 1.8, (len(vertices), 1)) * inwards
-    return [ab.Model.from_arrays(points, faces) for points in (rippled, inside)]
+    mesh = trimesh.Trimesh(*model.mesh_at(model.lod_max)[:2], process=False)
+    rippled = mesh.vertices + 0.02 * np.sin(9 * mesh.vertices[:, [1, 2, 0]])
+    inside = rippled - gap * rng.uniform(0.2, 1.8, (len(rippled), 1)) * mesh.vertex_normals
+    return [ab.Model.from_arrays(points, mesh.faces) for points in (rippled, inside)]
 
 
 def nested_cases(rng, gap, count=2):

@@ -222,15 +222,7 @@ def test_open_and_one_sided_parts():
     assert winding_of(mended.vertices, mended.faces).mixed_edges == 0
     corners = mended.vertices[mended.faces]
     assert (np.einsum("ij,ij->i", trimesh.triangles.cross(corners), corners.mean(1)) > 0).all()
-    n = 9
-    angle = 2 * np.pi * np.arange(n) / n
-    along, up = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1), np.array([0, 0, 1.0])
-    across = np.cos(angle / 2)[:, None] * up + np.sin(angle / 2)[:, None] * along
-    strip = np.concatenate([along + 0.3 * across, along - 0.3 * across])
-    rows = []
-    for i in range(n):
-        j, k = (i + 1, n + i + 1) if i + 1 < n else (n, 0)
-        rows += [(i, n + i, j), (j, n + i, k)]
+    strip, rows = np.random.default_rng(0).normal(size=(5, 3)), [(k, (k + 1) % 5, (k + 2) % 5) for k in range(5)]
     mesh = mesh_from_arrays(strip, rows)
     assert winding_of(strip, rows).mixed_edges > 0
     np.testing.assert_array_equal(orient_mesh(mesh).faces, mesh.faces)

@@ -83,9 +83,7 @@ class Plant:
         self.heard = {"stage_ms": stage_ms, "tests": float(tests.sum())}
         self.lods = lods
         errors = [model.error_at(lod) for model, lod in zip(models, lods.tolist())]
-        row = {"frame": len(self.rows), "time": time, "objects": len(lods), "budget_ms": self.controller.budget_ms}
-        row |= {"total_ms": sum(stage_ms.values()), "error_mean": float(np.mean(errors)), "oscillations": 0}
-        self.rows.append(SimpleNamespace(**row))
+        self.rows.append(SimpleNamespace(total_ms=sum(stage_ms.values()), error_mean=float(np.mean(errors))))
 
     def run(self, frames, load=1.0, hitch=1.0):
         """Run frames, and return the costs of all so far [ms]."""

@@ -208,11 +208,8 @@ def f_printed(alpha, gamma, far, wide):
 
 
 def see(camera, point):
-    """Project by a 4x4 view matrix; return the distance, and the place on the screen or None behind the camera."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = camera.view
-    matrix[:3, 3] = -camera.view @ camera.eye
-    x, y, z, _ = matrix @ [*point, 1.0]
+    """Return the distance of a point, and its place on the screen or None behind the camera."""
+    x, y, z = camera.view @ np.subtract(point, camera.eye)
     scale = camera.size[1] / 2 / math.tan(camera.field_of_view / 2)
     place = None if z >= 0 else np.array([scale * x / -z, scale * y / -z])
     return math.dist(point, camera.eye), place
