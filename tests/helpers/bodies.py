@@ -7,6 +7,7 @@ import trimesh
 import warp as wp
 
 import warp_abtree as ab
+from helpers.samples import random_poses
 from helpers.scenes import scene_with
 
 FLOOR = (0, 0, -0.5, 0, 0, 0, 1)
@@ -91,9 +92,7 @@ def selection_models():
 def strewn(count, device):
     """Return a scene with objects of all `selection_models` and importances at random places."""
     rng, models, scene = np.random.default_rng(0), selection_models(), ab.Scene(device)
-    for i in range(count):
-        turn = rng.normal(size=4)
-        pose = np.concatenate([rng.uniform(-4, 4, 3), turn / np.linalg.norm(turn)])
+    for i, pose in enumerate(random_poses(rng, count, 4.0)):
         scene.add(models[i % len(models)], pose, importance=1 + i // len(models) % 3)
     return scene
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 from helpers import refused
-from helpers.samples import corners_of, model_of_faces, sample
+from helpers.samples import corners_of, model_of_faces, random_quaternions, sample
 from helpers.solids import model_of, shell, turned, voxel_mesh
 from oracles.distance import brute_distances, exact_distance_sq
 from oracles.inside import parity
@@ -140,8 +140,7 @@ def test_distances_end_at_a_bound(device, within):
 
 def placed_objects(rng, device):
     """Return a scene of solids that overlap and are nested, surfaces, another world and a free place."""
-    scene, turns = ab.Scene(device), rng.normal(size=(9, 4))
-    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    scene, turns = ab.Scene(device), random_quaternions(rng, 9)
     names = ("torus", "small ball", "soup", "torus", "small ball", "torus", "small ball", "twins", "torus")
     for k, (name, turn) in enumerate(zip(names, turns)):
         model = sample(name)

@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 from helpers import refused
 from helpers.bodies import selection_models, strewn
-from helpers.samples import corners_of, grid
+from helpers.samples import corners_of, grid, random_poses
 from helpers.scenes import scene_with
 from oracles.distance import brute_distances, exact_distance_sq, lattice_points
 from oracles.motion import posed
@@ -262,8 +262,7 @@ def test_view_measures_distance_motion_and_focus(device):
     ways, last, before = [], [None] * 40, 0
     for _ in range(8):
         camera = Camera.look_at(rng.uniform(-1, 1, 3), rng.uniform(-5, 5, 3), size=(320, 240), far=3.5)
-        poses = np.concatenate([rng.uniform(-4, 4, (40, 3)), rng.normal(size=(40, 4))], axis=1)
-        poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+        poses = random_poses(rng, 40, 4.0)
         scene.set_poses(poses)
         view.look(camera)
         view.launch()

@@ -12,7 +12,7 @@ import warp as wp
 from conftest import ROOT
 from helpers import refused
 from helpers.faults import MORE_PAIRS, add_objects, check_buffer_lengths
-from helpers.samples import random_poses, sample
+from helpers.samples import random_poses, random_quaternions, sample
 from helpers.scenes import scene_with
 from oracles.triangle import into_frame_of_a
 from oracles.triangle_distance import near_faces
@@ -180,8 +180,7 @@ def scene_and_meshes(regime, device):
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.4)
     rng, poses = np.random.default_rng(3), np.zeros((4, 7))
     poses[1:, :3] = (0.1, 0, 0.3), (-0.5, 0.2, 0.5), (0, 0, 3)
-    poses[:, 3:] = rng.normal(size=(4, 4))
-    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1)[:, None]
+    poses[:, 3:] = random_quaternions(rng, 4)
     turn = trimesh.transformations.quaternion_matrix(poses[0, [6, 3, 4, 5]])[:3, :3]
     poses[:, :3] = poses[:, :3] @ turn.T
     models = map(ab.Model.load, (plate, ball, ball, ball))
