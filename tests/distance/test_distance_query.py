@@ -9,6 +9,7 @@ import warp as wp
 from helpers import refused
 from helpers.questions import (
     captured,
+    check_brackets,
     check_points,
     far_cases,
     in_a_row,
@@ -108,20 +109,12 @@ def test_far_from_the_origin(device):
 TOLERANCES = [{"tolerance": 1e-3}, {"tolerance": 0.3}, {"relative": 1e-3}, {"relative": 0.5}]
 
 
-def check_tolerance(exact, found, tolerances):
-    lower, upper = found.bracket.T
-    assert (lower <= exact.bracket[:, 1]).all() and (exact.bracket[:, 0] <= upper).all()
-    asked = np.full(len(lower), tolerances.get("tolerance", 0.0)) + tolerances.get("relative", 0.0) * upper
-    assert (upper - lower <= np.maximum(asked, 1e-12)).all()
-    assert (lower <= found.distance).all() and (found.distance <= upper).all()
-    np.testing.assert_array_equal(found.distance == 0, exact.any)
-
-
 @pytest.mark.parametrize("tolerances", TOLERANCES)
 def test_tolerance_is_the_width_of_the_bracket(device, tolerances):
     cases = parted_cases(np.random.default_rng(7), [("torus", "ball"), ("soup", "capsule")] * 20, faces=300)
     scene, pairs = scene_of(device, cases), pairs_of(cases)
-    check_tolerance(scene.intersect(pairs, "distance"), scene.intersect(pairs, "distance", **tolerances), tolerances)
+    truth = scene.intersect(pairs, "distance").distance
+    check_brackets(scene.intersect(pairs, "distance", **tolerances), truth, **tolerances)
     fresh = [ab.DistanceQuery(scene, pairs, **options).run() for options in ({}, tolerances)]
     assert max(tolerances.values()) < 0.1 or fresh[1].node_tests.sum() < fresh[0].node_tests.sum()
 
@@ -134,7 +127,7 @@ def test_many_pairs_within_a_tolerance(device, tolerances):
     scene, pairs = scene_of(device, cases), np.tile(pairs_of(cases), (30, 1))
     exact = scene.intersect(pairs, "distance")
     with testing.regime(warps=True):
-        check_tolerance(exact, ab.DistanceQuery(scene, pairs, **tolerances).run(), tolerances)
+        check_brackets(ab.DistanceQuery(scene, pairs, **tolerances).run(), exact.distance, **tolerances)
         beyond = exact.distance * rng.choice([1 - 1e-3, 1 - 1e-7, 1 + 1e-7, 1 + 1e-3], len(pairs))
         found = ab.DistanceQuery(scene, pairs, beyond=beyond, **tolerances).run()
     assert not np.isinf(found.distance[exact.bracket[:, 1] <= beyond]).any() and np.isinf(found.distance).any()
@@ -149,11 +142,9 @@ def test_beyond_ends_a_pair_that_is_farther(device):
     exact = scene.intersect(pairs, "distance")
     for beyond in (0.0, 0.25, 0.7 * exact.distance, exact.distance * (1 - 1e-11), exact.distance * (1 + 1e-11)):
         found = ab.DistanceQuery(scene, pairs, beyond=beyond).run()
-        ended = exact.distance > np.broadcast_to(beyond, len(pairs))
-        np.testing.assert_array_equal(np.isinf(found.distance), ended)
-        assert 0 < ended.sum() or np.all(beyond >= exact.distance)
-        np.testing.assert_array_equal(found.bracket[ended, 0], np.broadcast_to(beyond, len(pairs))[ended])
-        assert (found.bracket[ended, 1] == np.inf).all() and (found.point_faces[ended] == -1).all()
+        check_brackets(found, exact.distance, beyond=beyond)
+        ended = np.isinf(found.distance)
+        assert ended.any() or np.all(beyond >= exact.distance)
         for name in ANSWERS:
             np.testing.assert_array_equal(getattr(found, name)[~ended], getattr(exact, name)[~ended])
 

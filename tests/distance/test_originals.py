@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from helpers.questions import check_points, pairs_of, random_lod, scene_of
+from helpers.questions import check_brackets, check_points, pairs_of, random_lod, scene_of
 from helpers.samples import STILL, grid, random_poses, sample
 from helpers.scenes import scene_with
 from hypothesis import HealthCheck, given, settings
@@ -13,7 +13,6 @@ import warp_abtree as ab
 
 ROWS = ("any", "distance", "bracket", "points", "point_faces")
 SAMPLES = ("torus", "ball", "capsule", "soup", "cow")
-CLOSE = 1 + 1e-12
 
 
 def random_cases(rng, count):
@@ -30,24 +29,6 @@ def random_cases(rng, count):
 
 def finest(cases):
     return [(a, a.lod_max, pose_a, b, b.lod_max, pose_b) for a, _, pose_a, b, _, pose_b in cases]
-
-
-def check(result, truth, tolerance=0.0, relative=0.0, beyond=np.inf):
-    """Hold a result to the distances of the originals, and to the options that it was asked with."""
-    lower, upper = result.bracket.T
-    far = np.isinf(result.distance)
-    np.testing.assert_array_equal(result.any, truth == 0)
-    np.testing.assert_array_equal(result.distance == 0, truth == 0)
-    assert (lower <= truth * CLOSE).all() and (truth <= upper * CLOSE).all()
-    np.testing.assert_array_equal(far, truth > beyond)
-    assert (lower[far] == np.broadcast_to(beyond, len(truth))[far]).all() and np.isinf(upper[far]).all()
-    assert (result.point_faces[far] == -1).all() and np.isnan(result.points[far]).all()
-    near = ~far
-    width = np.maximum(tolerance, relative * result.distance[near])
-    assert (upper[near] - lower[near] <= width * CLOSE + 1e-11).all()
-    assert (lower[near] <= result.distance[near]).all() and (result.distance[near] <= upper[near]).all()
-    between = np.linalg.norm(result.points[:, 0] - result.points[:, 1], axis=1)[near]
-    np.testing.assert_allclose(between, result.distance[near], rtol=1e-9, atol=1e-13)
 
 
 OPTIONS = st.fixed_dictionaries(
@@ -69,7 +50,7 @@ def test_brackets_hold_the_originals(device, seed, options, swapped):
     scene = scene_of(device, cases)
     for _ in range(2):
         result = scene.intersect(pairs, "distance", originals=True, **options)
-        check(result, truth, **options)
+        check_brackets(result, truth, **options)
         if not swapped:
             check_points(result, finest(cases))
 
@@ -94,7 +75,7 @@ def test_poses_lods_and_objects_change(device):
     options = {"relative": 0.3}
     for turn in range(4):
         result = scene.intersect(pairs_of(cases), "distance", originals=True, **options)
-        check(result, reference.intersect(pairs_of(cases), "distance").distance, **options)
+        check_brackets(result, reference.intersect(pairs_of(cases), "distance").distance, **options)
         poses = random_poses(rng, 12, 2.5 + turn)
         scene.set_poses(poses)
         reference.set_poses(poses)
@@ -104,7 +85,7 @@ def test_poses_lods_and_objects_change(device):
         one.add(more, (1.0, 2.0, 7.0, 0, 0, 0, 1))
     pairs = np.array([[0, 12], [12, 5], [2, 3]])
     result = scene.intersect(pairs, "distance", originals=True, **options)
-    check(result, reference.intersect(pairs, "distance").distance, **options)
+    check_brackets(result, reference.intersect(pairs, "distance").distance, **options)
 
 
 @pytest.mark.parametrize("originals", [False, True])

@@ -142,5 +142,23 @@ def check_points(result, cases):
                 assert brute_distances(point[None], posed(vertices[corners[ids == face]], pose))[0] < 1e-12
 
 
+def check_brackets(result, truth, tolerance=0.0, relative=0.0, beyond=np.inf):
+    """Hold a result to true distances, and to the options that it was asked with."""
+    (lower, upper), close = result.bracket.T, 1 + 1e-12
+    far = np.isinf(result.distance)
+    np.testing.assert_array_equal(result.any, truth == 0)
+    np.testing.assert_array_equal(result.distance == 0, truth == 0)
+    assert (lower <= truth * close).all() and (truth <= upper * close).all()
+    np.testing.assert_array_equal(far, truth > beyond)
+    assert (lower[far] == np.broadcast_to(beyond, len(truth))[far]).all() and np.isinf(upper[far]).all()
+    assert (result.point_faces[far] == -1).all() and np.isnan(result.points[far]).all()
+    near = ~far
+    width = np.maximum(tolerance, relative * result.distance[near])
+    assert (upper[near] - lower[near] <= width * close + 1e-12).all()
+    assert (lower[near] <= result.distance[near]).all() and (result.distance[near] <= upper[near]).all()
+    between = np.linalg.norm(result.points[:, 0] - result.points[:, 1], axis=1)[near]
+    np.testing.assert_allclose(between, result.distance[near], rtol=1e-9, atol=1e-13)
+
+
 def to_bytes(result, names=("distance", "bracket", "points", "point_faces")):
     return [np.asarray(getattr(result, name)).tobytes() for name in names]
