@@ -1,24 +1,19 @@
 """Selection of LODs on the device against plain Python written from section 4.2 of the paper and from figure 4."""
 
 import math
-from fractions import Fraction
 from itertools import pairwise
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import warp as wp
 from helpers import refused
 from helpers.bodies import selection_models, strewn
-from helpers.samples import corners_of, grid, random_poses
+from helpers.samples import random_poses
 from helpers.scenes import scene_with
-from oracles.distance import brute_distances, exact_distance_sq, lattice_points
 from oracles.motion import posed
 
 from warp_abtree.lod.controllers import Feedback, PaperController, PredictiveController, ToleranceController
 from warp_abtree.lod.view import Camera, View
-from warp_abtree.model import lod_bounds
-from warp_abtree.model.progressive import build_progressive
 from warp_abtree.state.ladder import Ladder
 
 # Figure 4 by hand: g in frames 1 to 10, Case 1 until frame 5 and Case 2 from frame 6. Rows are Q1, Q2, Q3.
@@ -281,38 +276,3 @@ def test_view_measures_distance_motion_and_focus(device):
         assert np.allclose(view.focus.numpy(), focus, atol=1e-9)
         before += sum(place is None for place in last)
     assert 0 < before < 8 * 40 and (alpha > 3.5).any() and 0 < np.mean(np.array(focus) > 0) < 1
-
-
-def bumpy_sheet(size, height, seed):
-    vertices, faces = grid(size)
-    vertices += np.random.default_rng(seed).uniform(-height, height, vertices.shape)
-    return SimpleNamespace(vertices=vertices, faces=faces.astype(np.int32))
-
-
-def test_no_vertex_lies_beyond_the_error():
-    """The vertex that decides the error is measured with roundings, and would lie beyond it by some of them."""
-    close = 0
-    for seed in range(6):
-        progressive = build_progressive(bumpy_sheet(2, 0.3, seed), base_faces=1)
-        original = [[Fraction(x) for x in p] for p in progressive.vertex_pos[: progressive.vertex_count].tolist()]
-        for lod in range(progressive.lod_max):
-            farthest = max(exact_distance_sq(p, corners_of(progressive, lod)) for p in original)
-            bound = Fraction(float(progressive.lod_error[lod])) ** 2
-            assert farthest <= bound
-            close += farthest > bound * (1 - Fraction(2) ** -36)
-    assert close > 10, "elsewhere no vertex decides the error"
-
-
-@pytest.mark.parametrize("slots", [0, 8])
-def test_covers_on_fewer_faces_than_they_want_are_measured_again(slots, monkeypatch):
-    """Polygons that find no slot stand on a face that is used already, perhaps a far one, and the bound must say so."""
-    mesh, looser = bumpy_sheet(8, 0.3, 1), 0
-    plenty = build_progressive(mesh, base_faces=1, certify=True)
-    monkeypatch.setattr(lod_bounds, "SLOTS_PER_FACE", 0)
-    monkeypatch.setattr(lod_bounds, "SLOTS_EXTRA", slots)
-    progressive = build_progressive(mesh, base_faces=1)
-    points = lattice_points(plenty.vertex_pos[mesh.faces], 4)
-    for lod in range(0, progressive.lod_max, 5):
-        assert brute_distances(points, corners_of(progressive, lod)).max() <= progressive.lod_error[lod] + 1e-13
-        looser += progressive.lod_error[lod] > plenty.lod_error[lod]
-    assert looser > 0, "there is no want of slots here"

@@ -1,16 +1,17 @@
 """The progressive mesh against a plain replay of its merges, and its certified error against measured distances."""
 
 import dataclasses
+from fractions import Fraction
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
 from helpers import samples
-from helpers.samples import of_trimesh
+from helpers.samples import corners_of, of_trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from oracles.distance import brute_distances, farthest_points
+from oracles.distance import brute_distances, exact_distance_sq, farthest_points
 
 from warp_abtree import testing
 from warp_abtree.model import collapse, lod_bounds
@@ -274,3 +275,37 @@ def test_real_meshes(name, real_mesh_path):
     assert progressive.active_count(0) <= 10
     replay(mesh, progressive)
     check_error(mesh, progressive, steps=4, count=2000)
+
+
+def bumpy_sheet(size, height, seed):
+    vertices, faces = samples.grid(size)
+    vertices += np.random.default_rng(seed).uniform(-height, height, vertices.shape)
+    return mesh_from_arrays(vertices, faces)
+
+
+def test_no_vertex_lies_beyond_the_error():
+    """The vertex that decides the error is measured with roundings, and would lie beyond it by some of them."""
+    close = 0
+    for seed in range(6):
+        progressive = build_progressive(bumpy_sheet(2, 0.3, seed), base_faces=1)
+        original = [[Fraction(x) for x in p] for p in progressive.vertex_pos[: progressive.vertex_count].tolist()]
+        for lod in range(progressive.lod_max):
+            farthest = max(exact_distance_sq(p, corners_of(progressive, lod)) for p in original)
+            bound = Fraction(float(progressive.lod_error[lod])) ** 2
+            assert farthest <= bound
+            close += farthest > bound * (1 - Fraction(2) ** -36)
+    assert close > 10, "elsewhere no vertex decides the error"
+
+
+@pytest.mark.parametrize("slots", [0, 8])
+def test_covers_on_fewer_faces_than_they_want_are_measured_again(slots, monkeypatch):
+    """Polygons that find no slot stand on a face that is used already, perhaps a far one, and the bound must say so."""
+    mesh, looser = bumpy_sheet(8, 0.3, 1), 0
+    plenty = build_progressive(mesh, base_faces=1, certify=True)
+    monkeypatch.setattr(lod_bounds, "SLOTS_PER_FACE", 0)
+    monkeypatch.setattr(lod_bounds, "SLOTS_EXTRA", slots)
+    progressive = build_progressive(mesh, base_faces=1)
+    for lod in range(0, progressive.lod_max, 5):
+        assert measured_error(mesh, progressive, lod) <= progressive.lod_error[lod] + 1e-13
+        looser += progressive.lod_error[lod] > plenty.lod_error[lod]
+    assert looser > 0, "there is no want of slots here"
