@@ -1,21 +1,20 @@
 """Queries and kernels as plain functions, and poses that float64 holds exactly."""
 
-import itertools
 from functools import cache
 
 import numpy as np
 import warp as wp
 from oracles.distance import brute_distances, mesh_distance
 from oracles.motion import posed
+from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
 from helpers.samples import SHAPES, contact_poses, sample
 from helpers.scenes import scene_with
 from warp_abtree import testing
 
-SIGNS = itertools.product((1.0, -1.0), repeat=3)
-QUARTERS = [np.eye(3)[[*order]] * np.array([signs]).T for signs in SIGNS for order in itertools.permutations(range(3))]
-QUARTERS = [turn for turn in QUARTERS if np.linalg.det(turn) > 0]
+# The 24 rotations of a cube, exactly, without negative zeros.
+QUARTERS = Rotation.create_group("O").as_matrix().round() + 0.0
 
 
 def GpuQuery(*arguments, **options):
