@@ -6,7 +6,7 @@ The bounds are those of arithmetic, of coordinates, and the slack of brackets.
 import numpy as np
 import pytest
 import warp as wp
-from helpers.nested import speck_cases
+from helpers.nested import FACE_PAIRS, face_pairs, speck_cases
 from helpers.questions import launch, pairs_of, scene_of
 from helpers.samples import random_poses, sample
 from helpers.scenes import scene_with
@@ -24,8 +24,6 @@ from warp_abtree.kernels.triangle.triangle_pair import PAIR_ROUNDING, feature_we
 
 wp.set_module_options(native.options("distance/bound_faces.cuh"))
 
-KINDS = ("random", "parallel edges", "nearly parallel edges", "shared corners", "slivers", "caps", "zero area")
-KINDS += ("coplanar", "nearly touching", "huge and tiny", "lattice", "far from the origin")
 ROUNDING = float(PAIR_ROUNDING)
 
 
@@ -47,46 +45,6 @@ def measure(device, pairs):
     return answers[:, 0], answers[:, 1:].reshape(-1, 2, 3)
 
 
-def make_pairs(kind, rng, count):
-    """Return pairs of triangles, float64 (count, 2, 3, 3), some of them crossing."""
-    pairs = rng.normal(size=(count, 2, 3, 3))
-    pairs[:, 1] += rng.normal(size=(count, 1, 3)) * rng.choice([0.1, 1, 10], (count, 1, 1))
-    a, b = pairs[:, 0], pairs[:, 1]
-    small = 2.0 ** -rng.integers(5, 50, (count, 1))
-    if kind == "parallel edges":
-        b[:, 1] = b[:, 0] + (a[:, 1] - a[:, 0]) * rng.choice([-1, 0.5, 1, 2], (count, 1))
-    elif kind == "nearly parallel edges":
-        b[:, 1] = b[:, 0] + (a[:, 1] - a[:, 0]) + small * rng.normal(size=(count, 3))
-        b += (a[:, :1] - b[:, :1]) * (1 - small[:, None] * rng.choice([1, 0.1, 1e-3], (count, 1, 1)))
-    elif kind == "shared corners":
-        b[:, 0] = a[:, rng.integers(3)] + small * rng.normal(size=(count, 3)) * rng.choice([0, 1], (count, 1))
-    elif kind in ("slivers", "caps"):
-        for t in (a, b):
-            at = rng.random((count, 1)) if kind == "caps" else 0.0
-            t[:, 2] = t[:, 0] + at * (t[:, 1] - t[:, 0]) + small * rng.normal(size=(count, 3))
-    elif kind == "zero area":
-        pairs[:] = np.round(pairs * 64) / 64
-        a[:, 2] = np.where(rng.random((count, 1)) < 0.5, (a[:, 0] + a[:, 1]) / 2, a[:, 0])
-        b[:, 1:] = np.where(rng.random((count, 1, 1)) < 0.5, b[:, :1], b[:, 1:])
-    elif kind == "coplanar":
-        pairs[..., 2] = rng.integers(0, 2, (count, 2, 1)) * small[:, :, None]
-    elif kind == "nearly touching":
-        weights = rng.dirichlet(np.ones(3), count)
-        b += np.einsum("nk,nkx->nx", weights, a)[:, None] - b[:, :1]
-        normal = np.cross(a[:, 1] - a[:, 0], a[:, 2] - a[:, 0])
-        b += (small * normal)[:, None]
-        turn = np.sign(np.einsum("nkx,nx->nk", b - b[:, :1], normal))[..., None]
-        b[:, 1:] = (b[:, :1] + (b - b[:, :1]) * turn)[:, 1:]
-    elif kind == "huge and tiny":
-        pairs *= 2.0 ** rng.integers(-90, 90, (count, 1, 1, 1))
-        b *= 2.0 ** rng.integers(-60, 5, (count, 1, 1))
-    elif kind == "lattice":
-        pairs[:] = np.round(1.5 * pairs)
-    elif kind == "far from the origin":
-        pairs += 2.0 ** rng.integers(0, 40, (count, 1, 1, 1))
-    return pairs
-
-
 def apart(pairs):
     """Return the pairs that do not intersect, decided exactly."""
     index = np.arange(6 * len(pairs)).reshape(-1, 2, 3)
@@ -94,9 +52,9 @@ def apart(pairs):
     return pairs[~pairs_intersect(points, index[:, 0], points, index[:, 1], np.stack([rows, rows], 1))]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FACE_PAIRS)
 def test_equals_integers(device, kind):
-    pairs = apart(make_pairs(kind, np.random.default_rng(1), 800))
+    pairs = apart(face_pairs(kind, np.random.default_rng(1), 800))
     assert len(pairs) > 100
     distances, weights = measure(device, pairs)
     truth = np.array([triangle_distance(a, b) for a, b in pairs])

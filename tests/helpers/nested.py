@@ -1,4 +1,4 @@
-"""Surfaces inside one another, near or touching; and specks nearer to a large object than coordinates round."""
+"""Surfaces inside one another, near or touching; specks nearer to a large object than coordinates round; face pairs."""
 
 import numpy as np
 import trimesh
@@ -57,3 +57,52 @@ def speck_cases(rng, count, gap, size=1e-3):
         cases.append((mirrored(face), None, np.array(STILL), model_of_faces(speck), None, pose))
         distances.append(triangle_distance(face, into_frame_of_a(speck, STILL, pose)))
     return cases, np.array(distances)
+
+
+FACE_PAIRS = ("random", "parallel", "parallel edges", "nearly parallel edges", "shared corners", "slivers", "caps")
+FACE_PAIRS += ("zero area", "nearly points", "coplanar", "nearly touching", "huge and tiny", "lattice")
+FACE_PAIRS += ("far from the origin",)
+
+
+def face_pairs(kind, rng, count):
+    """Return pairs of triangles, float64 (count, 2, 3, 3), some of them crossing."""
+    pairs = rng.normal(size=(count, 2, 3, 3))
+    pairs[:, 1] += rng.normal(size=(count, 1, 3)) * rng.choice([0.1, 1, 10], (count, 1, 1))
+    a, b = pairs[:, 0], pairs[:, 1]
+    small = 2.0 ** -rng.integers(5, 50, (count, 1))
+    if kind == "parallel":
+        b[:] = a * rng.uniform(0.5, 2, (count, 1, 1)) + rng.normal(size=(count, 1, 3))
+    elif kind == "parallel edges":
+        b[:, 1] = b[:, 0] + (a[:, 1] - a[:, 0]) * rng.choice([-1, 0.5, 1, 2], (count, 1))
+    elif kind == "nearly parallel edges":
+        b[:, 1] = b[:, 0] + (a[:, 1] - a[:, 0]) + small * rng.normal(size=(count, 3))
+        b += (a[:, :1] - b[:, :1]) * (1 - small[:, None] * rng.choice([1, 0.1, 1e-3], (count, 1, 1)))
+    elif kind == "shared corners":
+        b[:, 0] = a[:, rng.integers(3)] + small * rng.normal(size=(count, 3)) * rng.choice([0, 1], (count, 1))
+    elif kind in ("slivers", "caps"):
+        for t in (a, b):
+            at = rng.random((count, 1)) if kind == "caps" else 0.0
+            t[:, 2] = t[:, 0] + at * (t[:, 1] - t[:, 0]) + small * rng.normal(size=(count, 3))
+    elif kind == "zero area":
+        pairs[:] = np.round(pairs * 64) / 64
+        a[:, 2] = np.where(rng.random((count, 1)) < 0.5, (a[:, 0] + a[:, 1]) / 2, a[:, 0])
+        b[:, 1:] = np.where(rng.random((count, 1, 1)) < 0.5, b[:, :1], b[:, 1:])
+    elif kind == "nearly points":
+        b[:, 1:] = b[:, :1] + 2.0**-40 * np.eye(3)[:2]
+    elif kind == "coplanar":
+        pairs[..., 2] = rng.integers(0, 2, (count, 2, 1)) * small[:, :, None]
+    elif kind == "nearly touching":
+        weights = rng.dirichlet(np.ones(3), count)
+        b += np.einsum("nk,nkx->nx", weights, a)[:, None] - b[:, :1]
+        normal = np.cross(a[:, 1] - a[:, 0], a[:, 2] - a[:, 0])
+        b += (small * normal)[:, None]
+        turn = np.sign(np.einsum("nkx,nx->nk", b - b[:, :1], normal))[..., None]
+        b[:, 1:] = (b[:, :1] + (b - b[:, :1]) * turn)[:, 1:]
+    elif kind == "huge and tiny":
+        pairs *= 2.0 ** rng.integers(-90, 90, (count, 1, 1, 1))
+        b *= 2.0 ** rng.integers(-60, 5, (count, 1, 1))
+    elif kind == "lattice":
+        pairs[:] = np.round(1.5 * pairs)
+    elif kind == "far from the origin":
+        pairs += 2.0 ** rng.integers(0, 40, (count, 1, 1, 1))
+    return pairs
