@@ -5,10 +5,10 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import warp as wp
-from helpers.questions import GpuQuery, to_matrix
-from helpers.samples import model_of_faces, random_quaternions, sample
+from helpers.nested import touching_soups
+from helpers.questions import GpuQuery, launch
+from helpers.samples import sample
 from helpers.scenes import scene_with
-from oracles.triangle import into_frame_of_a, quaternion_matrix
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
@@ -68,35 +68,18 @@ def compare_slabs_kernel(
     overlap_out[i] = wp.where(slabs_overlap(trees, pose, item), 1, 0)
 
 
-def touching_soups(device, rng, count, reach_a, reach_b, gap=0.0):
-    """Return a query of two soups, and their trees: faces of one number lie in about one plane and share a corner.
-
-    Or in two planes, so far apart.
-    """
-    first = rng.uniform(-1, 1, (count, 1, 3))
-    turn = quaternion_matrix(random_quaternions(rng, 1)[0])
-    pose = to_matrix(turn, rng.normal(size=3))
-    meet = into_frame_of_a(first.reshape(-1, 3), np.eye(4), pose).reshape(-1, 1, 3)
-    plane, along = rng.normal(size=(count, 2, 3)), rng.uniform(-1, 1, (2, count, 2, 2))
-    a = np.concatenate([meet, meet + reach_a * (along[0] @ plane)], 1)
-    normal = np.cross(plane[:, :1], plane[:, 1:])
-    first = first + gap * (normal / np.linalg.norm(normal, axis=2, keepdims=True)) @ turn
-    b = np.concatenate([first, first + reach_b * (along[1] @ plane @ turn)], 1)
-    models = [model_of_faces(points) for points in (a, b)]
-    query = GpuQuery(scene_with(device, models[0], (models[1], pose)), "faces", pairs=[(0, 1)])
-    rows = query.run().faces[:, 1:]
-    assert gap > 0 or (rows[rows[:, 0] == rows[:, 1], 0] == np.arange(count)).all()
-    return query, [model.tree for model in models]
+def ask(device, models, pose):
+    """Return a query, which has been launched, of two models, the second at a pose."""
+    query = GpuQuery(scene_with(device, models[0], (models[1], pose)), "any", pairs=[(0, 1)])
+    query.launch()
+    return query
 
 
-def count_lost(query, trees, levels, margin_factor, within=0.0):
+def count_lost(query, models, levels, margin_factor, within=0.0):
     """Return how many nodes so far above faces that meet slabs separate."""
-    leaves = np.stack([tree.leaf_node for tree in trees], 1)
-    nodes = wp.array(leaves >> levels, dtype=wp.vec2i, device=query.device)
-    overlap = wp.zeros(len(nodes), dtype=wp.int32, device=query.device)
-    inputs = [margin_factor, within, query.batch.trees, query.pair_batch, nodes, overlap]
-    wp.launch(compare_slabs_kernel, dim=len(nodes), inputs=inputs, device=query.device)
-    return int((overlap.numpy() == 0).sum())
+    nodes = np.stack([model.tree.leaf_node for model in models], 1) >> levels
+    inputs = margin_factor, within, query.batch.trees, query.pair_batch, nodes
+    return (launch(compare_slabs_kernel, query.device, len(nodes), *inputs) == 0).sum()
 
 
 @pytest.mark.parametrize("reach_a, reach_b", [(1e-3, 1e3), (1e3, 1e-3), (1e-3, 1e-3)])
@@ -104,10 +87,11 @@ def test_margin_covers_rounding(device, reach_a, reach_b):
     """Faces that touch in a point survive, as do the nodes above; without the margin some do not."""
     rng, lost = np.random.default_rng(8), 0
     for _ in range(10):
-        query, trees = touching_soups(device, rng, 128, reach_a, reach_b)
+        models, pose = touching_soups(rng, 128, reach_a, reach_b)
+        query = ask(device, models, pose)
         for levels in range(3):
-            assert count_lost(query, trees, levels, 1.0) == 0
-        lost += count_lost(query, trees, 0, 0.0)
+            assert count_lost(query, models, levels, 1.0) == 0
+        lost += count_lost(query, models, 0, 0.0)
     assert lost > 100
 
 
@@ -115,9 +99,10 @@ def test_margin_covers_rounding(device, reach_a, reach_b):
 def test_slabs_keep_what_is_nearer_than_a_gap(device, gap):
     """Faces in parallel planes a gap apart survive, as do the nodes above; within a little less most do not."""
     rng = np.random.default_rng(9)
-    query, trees = touching_soups(device, rng, 128, 1.0, 1.0, gap if gap < 1e9 else 0.0)
+    models, pose = touching_soups(rng, 128, 1.0, 1.0, gap if gap < 1e9 else 0.0)
+    query = ask(device, models, pose)
     for levels in range(3):
-        assert count_lost(query, trees, levels, 1.0, gap) == 0
-        assert count_lost(query, trees, levels, 1.0, 1e300 * gap) == 0
+        assert count_lost(query, models, levels, 1.0, gap) == 0
+        assert count_lost(query, models, levels, 1.0, 1e300 * gap) == 0
     if 1e-3 < gap < 1e9:
-        assert count_lost(query, trees, 0, 1.0, 0.95 * gap) > 64
+        assert count_lost(query, models, 0, 1.0, 0.95 * gap) > 64

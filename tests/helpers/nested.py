@@ -6,6 +6,7 @@ from oracles.triangle import into_frame_of_a, quaternion_matrix
 from oracles.triangle_distance import triangle_distance
 
 import warp_abtree as ab
+from helpers.questions import to_matrix
 from helpers.samples import STILL, mirrored, model_of_faces, random_poses, random_quaternions, sample
 
 STEP = 2.0**-23  # of float32 from 1 to 2
@@ -57,6 +58,24 @@ def speck_cases(rng, count, gap, size=1e-3):
         cases.append((mirrored(face), None, np.array(STILL), model_of_faces(speck), None, pose))
         distances.append(triangle_distance(face, into_frame_of_a(speck, STILL, pose)))
     return cases, np.array(distances)
+
+
+def touching_soups(rng, count, reach_a, reach_b, gap=0.0):
+    """Return models of two soups and the pose of the second.
+
+    Faces of one number lie in about one plane and share a corner, to the bit in the frame of the first, or lie in two
+    planes, so far apart.
+    """
+    first = rng.uniform(-1, 1, (count, 1, 3))
+    turn = quaternion_matrix(random_quaternions(rng, 1)[0])
+    pose = to_matrix(turn, rng.normal(size=3))
+    meet = into_frame_of_a(first.reshape(-1, 3), np.eye(4), pose).reshape(-1, 1, 3)
+    plane, along = rng.normal(size=(count, 2, 3)), rng.uniform(-1, 1, (2, count, 2, 2))
+    a = np.concatenate([meet, meet + reach_a * (along[0] @ plane)], 1)
+    normal = np.cross(plane[:, :1], plane[:, 1:])
+    first = first + gap * (normal / np.linalg.norm(normal, axis=2, keepdims=True)) @ turn
+    b = np.concatenate([first, first + reach_b * (along[1] @ plane @ turn)], 1)
+    return [model_of_faces(points) for points in (a, b)], pose
 
 
 FACE_PAIRS = ("random", "parallel", "parallel edges", "nearly parallel edges", "shared corners", "slivers", "caps")
