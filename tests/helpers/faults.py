@@ -93,14 +93,22 @@ SHORTAGE = r"Failed to allocate \d+ bytes on device '{}'"
 
 
 class Fault:
-    """Fails at a chosen step of a call; subclasses say what a step is, how it fails, and what it leaves unchanged.
-
-    `inject` returns (failed, result) of a call whose steps fail after so many of them.
-    """
+    """Fails at a chosen step of a call; subclasses say what a step is, how it fails, and what it leaves unchanged."""
 
     def __init__(self, device):
-        self.device = device
-        self.left = None
+        self.device, self.allocator = device, wp.get_device(device).get_allocator()
+        self.left = None  # steps until one fails, None outside of calls
+
+    def inject(self, call, count):
+        """Return (failed, result) of a call whose steps fail after so many of them."""
+        self.left = count
+        try:
+            return False, call()
+        except BaseException as error:
+            self.check_error(error)
+            return True, None
+        finally:
+            self.left = None
 
     def everywhere(self, make, call, check):
         """Repeat call(make()), its first, second, third ... step failing, until it succeeds.
@@ -129,9 +137,8 @@ class MemoryShortage(Fault):
 
     def __init__(self, device, monkeypatch):
         super().__init__(device)
-        allocator = wp.get_device(device).get_allocator()
-        self._allocate = allocator.allocate
-        monkeypatch.setattr(allocator, "allocate", self.allocate)
+        self._allocate = self.allocator.allocate
+        monkeypatch.setattr(self.allocator, "allocate", self.allocate)
 
     def allocate(self, size):
         if self.left is None:
@@ -139,16 +146,9 @@ class MemoryShortage(Fault):
         self.left -= 1
         return self._allocate(size if self.left >= 0 else 2**62)
 
-    def inject(self, call, count):
-        self.left = count
-        try:
-            return False, call()
-        except RuntimeError as error:
-            assert re.fullmatch(SHORTAGE.format(self.device), str(error)), error
-            assert error.__context__ is None, "one error, not an error on the way from another"
-            return True, None
-        finally:
-            self.left = None
+    def check_error(self, error):
+        assert re.fullmatch(SHORTAGE.format(self.device), str(error)) and isinstance(error, RuntimeError), error
+        assert error.__context__ is None, "one error, not an error on the way from another"
 
     check_scene = staticmethod(check_scene)
 
@@ -162,10 +162,8 @@ class Interruption(Fault):
 
     def __init__(self, device, monkeypatch):
         super().__init__(device)
-        allocator = wp.get_device(device).get_allocator()
-        steps = [(wp, "launch"), (wp.Launch, "launch"), (wp, "copy")]
-        steps += [(wp.utils, "radix_sort_pairs")]
-        steps += [(wp.array, "fill_"), (wp.array, "zero_"), (wp.array, "assign"), (allocator, "allocate")]
+        steps = [(wp, "launch"), (wp.Launch, "launch"), (wp, "copy"), (wp.utils, "radix_sort_pairs")]
+        steps += [(wp.array, "fill_"), (wp.array, "zero_"), (wp.array, "assign"), (self.allocator, "allocate")]
         for owner, name in steps:
             monkeypatch.setattr(owner, name, self._counted(getattr(owner, name)))
 
@@ -182,15 +180,11 @@ class Interruption(Fault):
         return call
 
     def inject(self, call, count):
-        self.left = count
         self.error = (KeyboardInterrupt(), RuntimeError("the kernel cache cannot be written"))[count % 2]
-        try:
-            return False, call()
-        except BaseException as caught:
-            assert caught is self.error, f"{caught!r}, not the error that was raised"
-            return True, None
-        finally:
-            self.left = None
+        return super().inject(call, count)
+
+    def check_error(self, error):
+        assert error is self.error, f"{error!r}, not the error that was raised"
 
     check_scene = staticmethod(check_answers)
 
