@@ -28,14 +28,14 @@ from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR
 DOUBLES = {"BOUND_2D": BOUND_2D, "BOUND_3D": BOUND_3D, "BOUND_DOUBLE": BOUND_DOUBLE, "COORDINATE_MIN": COORDINATE_MIN}
 DOUBLES |= {"RELATIVE_ERROR": RELATIVE_ERROR, "SHORTEST_NORMAL": SHORTEST_NORMAL, "CLOSEST": CLOSEST}
 DOUBLES |= {"LEAST_SEPARATION": LEAST_SEPARATION, "ALONG": ALONG, "NO_DISTANCE": NO_DISTANCE}
+MODULES = [info.name for info in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}.") if not info.ispkg]
 PASSES = ("resolve_rounded", "float64_filter", "resolve_inexact")
 # Approximate on purpose, or without arithmetic.
 OTHERS = re.compile(r"\.(collapse|heap|quadric|vertex_forest|lod|arrays|native)\b")
 
 
 def test_modules_with_signs_do_not_contract():
-    names = [info.name for info in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}.") if not info.ispkg]
-    modules = [wp.get_module(importlib.import_module(name).__name__) for name in names if not OTHERS.search(name)]
+    modules = [wp.get_module(importlib.import_module(name).__name__) for name in MODULES if not OTHERS.search(name)]
     makers = [functools.partial(dual_tree.warp_traversal, for_any=for_any) for for_any in (False, True)]
     modules += [make(int(mode)).module for mode in (EXACT, FLOAT32) for make in (simd.thread_traversal, *makers)]
     modules += [make(within.PROVED_APART).module for make in (within.thread_within, within.warp_within)]
@@ -94,7 +94,6 @@ def test_ptx_of_the_traversal_is_not_contracted(tmp_path, case):
 
 FILES = sorted(path.relative_to(native.FOLDER).as_posix() for path in native.FOLDER.rglob("*.*h"))
 FUNCTION = re.compile(r"^[^\s#/][^\n;]*? (\w+)\(((?:[^()]|\(\))*)\) \{", re.M)
-MODULES = [info.name for info in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}.") if not info.ispkg]
 
 
 def functions_of_headers():

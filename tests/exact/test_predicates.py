@@ -342,11 +342,6 @@ def float32_points(rng, kind):
     return points / np.maximum(1e-200, np.abs(points).max((1, 2), keepdims=True))
 
 
-def check_sides(error, points, truth, device):
-    """Compare the signs that float32 is sure of; return which those are."""
-    return sure_of(float32_signs(error, FLOAT32_UNIT, points, device), truth)
-
-
 def true_sides(points):
     return np.stack([true_signs(points[:, [0, 1, 2, k]]) for k in (3, 4, 5)] * 2, 1)
 
@@ -364,7 +359,7 @@ def test_float32_filter_is_right_where_it_is_sure(device, kind, off):
     shift = np.where(rng.random((COUNT, 1, 1)) < 0.5, worst, rng.uniform(-1, 1, points.shape)) * off
     moved = (points + shift).astype(np.float32)
     error = 2.02 * np.abs(moved - points).max((1, 2))
-    sure = check_sides(error, moved, truth, device)
+    sure = sure_of(float32_signs(error, FLOAT32_UNIT, moved, device), truth)
     plain = float32_signs(0 * error, FLOAT32_UNIT, moved, device)
     if kind != "random":
         assert (plain != truth)[plain != int(UNCERTAIN)].any(), "coordinates that are off must be reckoned with here"
@@ -378,7 +373,7 @@ def test_float32_filter_covers_its_own_rounding(device, kind):
     """Coordinates that float32 holds exactly: only the arithmetic rounds."""
     points = float32_points(np.random.default_rng(8), kind).astype(np.float32).astype(float)
     truth = true_sides(points)
-    check_sides(np.zeros(COUNT), points, truth, device)
+    sure_of(float32_signs(np.zeros(COUNT), FLOAT32_UNIT, points, device), truth)
     plain = float32_signs(np.zeros(COUNT), 0.0, points, device)
     assert (plain != int(UNCERTAIN)).all()
     assert (plain != truth).any() == (kind != "random"), "float32 alone is good enough for points at random only"

@@ -143,6 +143,8 @@ def test_collada_coordinates_are_those_of_the_text(dae):
 
 
 TURN = trimesh.transformations.rotation_matrix(np.radians(30), [1, 2, 3])
+# From (9, 8, 7) along -x, (0, 2, 1) upwards: columns to the right, upwards and back.
+LOOK = np.array([[0, 0, 1, 9], [1 / 5**0.5, 2 / 5**0.5, 0, 8], [-2 / 5**0.5, 1 / 5**0.5, 0, 7], [0, 0, 0, 1]])
 
 
 @pytest.mark.parametrize(
@@ -152,14 +154,10 @@ TURN = trimesh.transformations.rotation_matrix(np.radians(30), [1, 2, 3])
         (["<rotate>1 2 3 30</rotate>", "<scale>0.1 0.2 -0.3</scale>"], TURN @ np.diag([0.1, 0.2, -0.3, 1])),
         (["<rotate>0 0 0 30</rotate>", "<matrix>2 0 0 0.1 0 3 0 0 0 0 1 0 0 0 0 1</matrix>"],
          [[2, 0, 0, 0.1], [0, 3, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
-        (["<lookat>9 8 7 5 8 7 0 2 1</lookat>"], None),
+        (["<lookat>9 8 7 5 8 7 0 2 1</lookat>"], LOOK),
     ],
 )  # fmt: skip
 def test_transforms_of_collada_are_those_of_the_text(dae, texts, expected):
-    if expected is None:
-        back, up = np.array([1.0, 0, 0]), np.array([0, 2, 1]) / 5**0.5
-        expected = np.eye(4)
-        expected[:3, :3], expected[:3, 3] = np.stack([np.cross(up, back), up, back], 1), (9, 8, 7)
     scene = ab.scene_from_file(dae("<instance_geometry", "".join(texts) + "<instance_geometry"), device="cpu")
     corners = trimesh.transform_points(BOX.triangles.reshape(-1, 3), expected)
     found = np.sort(posed_triangles(scene, 0).reshape(-1, 3), axis=0)
