@@ -12,6 +12,7 @@ import warp as wp
 from helpers.questions import ask, launch
 from helpers.samples import model_of_faces, random_quaternions
 from helpers.scenes import scene_with
+from oracles.triangle import fractions
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
@@ -23,11 +24,6 @@ from warp_abtree.kernels.triangle.distance import triangles_near
 wp.set_module_options(native.options())
 
 SKEW = 2.0**-22  # scenes refuse a frame that is off by 10^-6
-
-
-def fractions(x):
-    """Return numbers as fractions, an array of objects."""
-    return np.vectorize(lambda v: Fraction(float(v)), otypes=[object])(x)
 
 
 def distance_over(p, q):

@@ -1,7 +1,6 @@
 """Orientation: winding by exact rays and loops, what mends it, and what refuses or warns where it is wrong."""
 
 import json
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from helpers.viewer import write_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.inside import winding_number
-from oracles.triangle import cross, dot
+from oracles.triangle import cross, dot, fractions
 
 import warp_abtree as ab
 from warp_abtree.app import SceneError, load_scene
@@ -136,8 +135,7 @@ def test_parts_that_closed_ones_hold_are_turned(name):
 
 def volume(vertices, faces):
     """Return six times the volume within a surface, exactly."""
-    corners = [[[Fraction(x) for x in corner] for corner in face] for face in vertices[faces].tolist()]
-    return sum(dot(a, cross(b, c)) for a, b, c in corners)
+    return sum(dot(a, cross(b, c)) for a, b, c in fractions(vertices[faces]))
 
 
 @pytest.mark.parametrize("seed", range(6))

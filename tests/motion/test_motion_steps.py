@@ -10,7 +10,7 @@ from helpers.motions import STILL, find
 from helpers.questions import launch, pairs_of, scene_of
 from helpers.samples import corners_of, model_of_faces, random_quaternions
 from oracles.motion import translation_contact
-from oracles.triangle import quaternion_matrix
+from oracles.triangle import fractions, quaternion_matrix
 
 from warp_abtree.kernels.motion.face_pair import bend_of_face, safe_step, step_along, time_after
 from warp_abtree.kernels.motion.linear import straight_step
@@ -146,7 +146,9 @@ def test_contacts_are_not_late_where_float64_rounds_much(device, far, size, line
         cases.append([models[0], models[0].lod_max, still, models[1], models[1].lod_max, start])
         ends += [still, end]
         corners = [corners_of(model) for model in models]
-        truths.append(contact_in_fractions(corners, still[:3], start[:3], end[:3]))
+        first, last = fractions(start[:3]), fractions(end[:3])
+        posed = fractions(corners[0]) + fractions(still[:3]), fractions(corners[1]) + first
+        truths.append(translation_contact(*posed, last - first))
     result = find(device, cases, np.array(ends), tolerance=2.0**-40, linear=linear)
     met = scene_of(device, cases).intersect(pairs_of(cases)).any
     touching = [truth is not None for truth in truths]
@@ -154,14 +156,6 @@ def test_contacts_are_not_late_where_float64_rounds_much(device, far, size, line
     for truth, hit, time, clear in zip(truths, met, result.time.tolist(), result.clear, strict=True):
         if not hit and truth is not None:
             assert not clear and Fraction(time) <= truth
-
-
-def contact_in_fractions(corners, still, start, end):
-    """Return when faces first touch that move from start to end past others, all of which are sums of float64."""
-    exact = [[[[Fraction(x) for x in corner] for corner in face] for face in soup.tolist()] for soup in corners]
-    places = [[Fraction(x) for x in place.tolist()] for place in (still, start, end)]
-    posed = [np.array(soup) + np.array(place) for soup, place in zip(exact, places)]
-    return translation_contact(posed[0], posed[1], np.array(places[2]) - np.array(places[1]))
 
 
 @wp.kernel(module="unique", module_options={"fuse_fp": False})

@@ -68,6 +68,11 @@ def integer_points(*arrays):
     return result
 
 
+def fractions(x):
+    """Return numbers as fractions, an array of objects."""
+    return np.vectorize(lambda v: Fraction(float(v)), otypes=[object])(x)
+
+
 ZERO = (0, 0, 0)
 
 

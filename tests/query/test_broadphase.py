@@ -12,7 +12,7 @@ from helpers.questions import sort_rows, to_matrix
 from helpers.samples import STILL, random_poses, raw_state, sample
 from helpers.scenes import scene_with
 from hypothesis import HealthCheck, given, settings
-from oracles.triangle import pose_matrix
+from oracles.triangle import fractions, pose_matrix
 
 import warp_abtree as ab
 from warp_abtree import testing
@@ -143,12 +143,10 @@ def test_sorted_pairs_and_their_keys(device, worlds):
 
 def exact_box(scene, i, pose):
     """Return lower and upper end of an object's posed root box, three fractions each, for a pose taken as a matrix."""
-    state, centre = raw_state(scene, i), scene.models[scene.object_model[i]].centre.tolist()
-    ends = [state[name][1].tolist() for name in ("lower", "upper")]
-    whole = [[Fraction(x) + Fraction(c) for x, c in zip(end, centre)] for end in ends]
-    rows = [[Fraction(r) for r in row] for row in pose[:3, :3].tolist()]
-    parts = [[sorted((r * p, r * q)) for r, p, q in zip(row, *whole)] for row in rows]
-    return [[Fraction(x) + sum(p[end] for p in row) for x, row in zip(pose[:3, 3].tolist(), parts)] for end in (0, 1)]
+    state, centre = raw_state(scene, i), scene.models[scene.object_model[i]].centre
+    ends = fractions([state["lower"][1], state["upper"][1]]) + fractions(centre)
+    parts = fractions(pose[:3, :3]) * ends[:, None]
+    return [fractions(pose[:3, 3]) + part.sum(1) for part in (parts.min(0), parts.max(0))]
 
 
 @pytest.mark.parametrize("far", [0.0, 2.0**36])
