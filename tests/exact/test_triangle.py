@@ -33,12 +33,6 @@ def meet(pairs, device):
     return exact != 0
 
 
-def truth(pairs):
-    faces = np.arange(3 * len(pairs)).reshape(-1, 3)
-    rows = np.tile(np.arange(len(pairs))[:, None], 2)
-    return oracle.pairs_intersect(pairs[:, 0].reshape(-1, 3), faces, pairs[:, 1].reshape(-1, 3), faces, rows)
-
-
 def generic(rng, count):
     """Triangles of all sizes near each other."""
     size = 2.0 ** rng.uniform(-3, 1, (count, 2, 1, 1))
@@ -123,7 +117,9 @@ def test_answers_are_exact(device, kind, share):
     make, count = KINDS[kind]
     rng, count = np.random.default_rng(1), count // share
     pairs = make(rng, count)
-    expected = truth(pairs)
+    faces, rows = np.arange(3 * count).reshape(-1, 3), np.tile(np.arange(count)[:, None], 2)
+    points_a, points_b = pairs[:, 0].reshape(-1, 3), pairs[:, 1].reshape(-1, 3)
+    expected = oracle.pairs_intersect(points_a, faces, points_b, faces, rows)
     assert 0.02 < expected.mean() < 0.99, "both answers need to occur"
     order = rng.permuted(np.tile(np.arange(3), (count, 2, 1)), axis=2)
     pairs = np.take_along_axis(pairs, order[:, :, :, None], 2)

@@ -15,18 +15,16 @@ from warp_abtree.model.tree import active_build
 pytestmark = pytest.mark.usefixtures("half_refitted_in_part")
 
 
-def without_merges(vertices, faces):
-    return oracle.Progressive([-1] * len(vertices), vertices.tolist(), faces.tolist(), [0] * len(faces), [0], [])
-
-
 @settings(deadline=None, max_examples=60)
 @given(
     st.integers(1, 70), st.integers(0, 2**31), st.sampled_from([0, 2, 3, 9]), st.sampled_from([1.0, 2.0**90, 2.0**-90])
 )
 def test_build_of_soups_equals_the_oracle(count, seed, lattice, scale):
     vertices, faces = soup(count, seed, lattice)
-    tree = active_build(vertices * scale, faces)
-    numbers = [leaf.number for leaf in oracle.active_build(without_merges(vertices * scale, faces)).leaf]
+    vertices = vertices * scale
+    tree, none = active_build(vertices, faces), [-1] * len(vertices)
+    mesh = oracle.Progressive(none, vertices.tolist(), faces.tolist(), [0] * len(faces), [0], [])
+    numbers = [leaf.number for leaf in oracle.active_build(mesh).leaf]
     assert tree.leaf_node.tolist() == numbers
     assert tree.depth == (len(faces) - 1).bit_length() and tree.node_count == 2 << tree.depth
     inverse = np.full(tree.node_count, -1)

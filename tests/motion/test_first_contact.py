@@ -17,15 +17,10 @@ from warp_abtree import testing
 from warp_abtree.kernels.motion import group
 
 
-def poses_at(cases, ends, times):
-    """Return the poses of all objects, each pair's at its own time."""
-    times = np.repeat(np.broadcast_to(times, len(cases)), 2)
-    return np.array([pose_between(*row) for row in zip(starts_of(cases), ends, times)])
-
-
 def meets(scene, cases, ends, times):
-    """Return which pairs intersect at times, exactly for the poses there."""
-    scene.set_poses(poses_at(cases, ends, times))
+    """Return which pairs intersect at times, each pair at its own, exactly for the poses there."""
+    times = np.repeat(np.broadcast_to(times, len(cases)), 2)
+    scene.set_poses(np.array([pose_between(*row) for row in zip(starts_of(cases), ends, times)]))
     return scene.intersect(pairs_of(cases)).any
 
 
