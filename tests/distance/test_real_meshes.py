@@ -15,18 +15,12 @@ PAIRS = (("cow", "rocker-arm"), ("fandisk", "cow"), ("stanford-bunny", "fandisk"
 POSES = 500
 
 
-def place_about(a, b, poses):
-    """Return poses whose positions are those of B's centre about A's."""
-    poses = poses.copy()
-    poses[:, :3] += a.centre - np.array([quaternion_matrix(q) @ b.centre for q in poses[:, 3:]])
-    return poses
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("names", PAIRS, ids="-".join)
 def test_equals_fcl(device, names):
     a, b = map(sample, names)
-    poses = place_about(a, b, random_poses(np.random.default_rng(1), POSES, 1.5))
+    poses = random_poses(np.random.default_rng(1), POSES, 1.5)  # positions of B's centre about A's
+    poses[:, :3] += a.centre - np.array([quaternion_matrix(q) @ b.centre for q in poses[:, 3:]])
     scene = scene_of(device, [(a, None, STILL, b, None, pose) for pose in poses])
     pairs = np.arange(2 * POSES).reshape(-1, 2)
     query = ab.DistanceQuery(scene, pairs)

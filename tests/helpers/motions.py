@@ -50,7 +50,8 @@ def random_boxes(rng, count, name):
     (size, off, world, way, most), models, poses = FAMILIES[name], [], []
     for _ in range(2 * count):
         at = off * rng.normal(size=3)
-        models.append(box_model(at - 0.5 * size, size * rng.uniform(0.5, 1.5, 3)))
+        corners = at - 0.5 * size + CORNERS * size * rng.uniform(0.5, 1.5, 3)
+        models.append(ab.Model.from_arrays(corners, CUBE, base_faces=len(CUBE)))
         first = Rotation.from_quat(random_quaternions(rng, 1)[0])
         angle = most * rng.uniform() * (rng.uniform() > 1 / 3)
         axis = rng.normal(size=3)
@@ -66,10 +67,6 @@ def pose_matrices(poses):
     matrices = np.tile(np.eye(4), (len(poses), 1, 1))
     matrices[:, :3, :3], matrices[:, :3, 3] = Rotation.from_quat(poses[:, 3:]).as_matrix(), poses[:, :3]
     return matrices
-
-
-def box_model(low, size):
-    return ab.Model.from_arrays(low + CORNERS * size, CUBE, base_faces=len(CUBE))
 
 
 def skewed_boxes(rng, count, kind):

@@ -42,18 +42,14 @@ def test_never_late_and_early_by_the_tolerance(device, tolerance):
     np.testing.assert_array_equal(meets(scene, cases, ends, np.minimum(time + tolerance, 1))[touching], True)
 
 
-def random_soup(rng, count, size):
-    """Return corners (f, 3, 3) of faces on a grid of 2^-10, in general position."""
-    return np.round(rng.normal(size=(count, 1, 3)) * 300 + rng.normal(size=(count, 3, 3)) * size) / 1024
-
-
 @pytest.mark.parametrize("far", [1, 2**14])
 def test_translations_against_fractions(device, far):
     """Small soups that pass each other near the middle of their way, which is long or not."""
     rng = np.random.default_rng(3)
     cases, ends, truths = [], [], []
     while len(cases) < 30:
-        a, b = (random_soup(rng, 4, 300) for _ in range(2))
+        # Faces on a grid of 2^-10, in general position.
+        a, b = (np.round(300 * (rng.normal(size=(4, 1, 3)) + rng.normal(size=(4, 3, 3)))) / 1024 for _ in range(2))
         way, off = (np.round(1024 * rng.normal(size=3)) / 1024 for _ in range(2))
         start, end = off - far * way, off + 2 * far * way
         still, pose = STILL, np.concatenate([start, STILL[3:]])
