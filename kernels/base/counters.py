@@ -3,6 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels import native
+from warp_abtree.kernels.base.lanes import hold_uniform
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -23,8 +24,14 @@ def take_slots(total: wp.array(dtype=wp.int32), count: wp.int32) -> wp.int32:
 
 
 @native.func_native()
-def take_turn(taken: wp.array(dtype=wp.int32), i: wp.int32) -> wp.int32:
-    """Return to a warp how many have called this with an i before; those have begun, so it may wait for them."""
+def take_once(counts: wp.array(dtype=wp.int32), i: wp.int32, count: wp.int32) -> wp.int32:
+    """Count more into counts[i] once a warp; return what it was, in the first lane alone, without waiting for it."""
+
+
+@wp.func
+def take_together(counts: wp.array(dtype=wp.int32), i: wp.int32, count: wp.int32):
+    """Count more into counts[i] once a warp; return what it was to all lanes."""
+    return hold_uniform(take_once(counts, i, count))
 
 
 @native.func_native()
@@ -38,11 +45,6 @@ def wait_for_counts(counts: wp.array(dtype=wp.int32), ids: wp.vec2i, values: wp.
 @native.func_native()
 def publish_counts(counts: wp.array(dtype=wp.int32), ids: wp.vec2i, values: wp.vec2i):
     """Set two counts, but to no value below 1, after all that the warp has written."""
-
-
-@native.func_native()
-def add_warp_sum(totals: wp.array(dtype=wp.int64), i: wp.int32, x: wp.int32):
-    """Add a value of every lane to totals[i] with one atomic a warp."""
 
 
 @native.func_native()

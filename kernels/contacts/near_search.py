@@ -9,14 +9,13 @@ import functools
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.contacts.slots import Slots
 from warp_abtree.kernels.intersect import simd
-from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, Hits
+from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.intersect.relative_pose import pairs_starter
-from warp_abtree.kernels.search.load_balance import Work
-from warp_abtree.kernels.search.thread_search import FaceTests, ThreadPolicy, thread_search
+from warp_abtree.kernels.search.thread_search import FaceLists, FaceTests, ThreadPolicy, thread_search
 
 wp.set_module_options(native.options("contacts/near_offer.cuh", "contacts/offer_list.h"))
 
@@ -31,8 +30,7 @@ class NearFound:
 
 @native.func_native(cpu=True)
 def simd_offer_faces(
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     count: wp.int32,
     faces: wp.array(dtype=wp.int64),
@@ -52,18 +50,6 @@ def simd_offer_faces(
 @functools.cache
 def thread_near_search():
     """Return the kernel whose threads share the object pairs."""
-    start_pairs = pairs_starter(True)
-
-    @wp.func
-    def start(
-        output: wp.int32,
-        trees: Trees,
-        batch: PairBatch,
-        within: wp.array(dtype=wp.float64),
-        found: NearFound,
-        work: Work,
-    ):
-        start_pairs(output, trees, batch, within, found.hits, work)
 
     @wp.func
     def test(
@@ -71,28 +57,21 @@ def thread_near_search():
         trees: Trees,
         batch: PairBatch,
         pair: wp.int32,
-        waiting: wp.int32,
-        faces: wp.array(dtype=wp.int64),
-        uncertain: wp.array(dtype=wp.int64),
-        apart: wp.array(dtype=wp.int64),
+        lists: wp.ref[FaceLists],
         found: NearFound,
         tests: wp.ref[FaceTests],
     ):
         """Test leaf pairs, report those that meet, and offer those that are apart."""
-        pose, parted, slots = batch.poses[pair], simd.Filtered(), found.slots
-        simd.test_gap_pairs(trees, pose, waiting, faces, uncertain, apart, parted, tests)
+        pose, slots = batch.poses[pair], found.slots
+        simd.test_gap_pairs(trees, pose, lists, tests)
         bounds = wp.vec2(wp.float32(found.hits.gap[pair] * pose.scale), slots.weight[pair])
-        widths, count = slots.widths[pair], parted.apart
-        if count > 0:
+        if lists.apart > 0:
             slots.used[pair] = 1
         simd_offer_faces(
-            trees.models, trees.states, pose, count, apart, bounds, slots.directions, widths, pair, slots.key
+            trees, pose, lists.apart, lists.apart_faces, bounds, slots.directions, slots.widths[pair], pair, slots.key
         )
-        return simd.report_met(output, pair, pose.swapped, parted.met, faces, found.hits, tests)
+        return simd.report_met(output, pair, pose.swapped, lists, found.hits, tests)
 
-    @wp.func
-    def write(p: wp.int32, node_tests: wp.int64, tests: FaceTests, found: NearFound):
-        simd.write_counts(p, node_tests, tests, found.hits)
-
+    start = pairs_starter(True)
     headers = (*simd.FILTERS, "contacts/near_offer.cuh", "contacts/offer_list.h")
-    return thread_search(ThreadPolicy(headers, True, True, NearFound, start, test, write), int(OUTPUT_ANY))
+    return thread_search(ThreadPolicy(headers, True, True, NearFound, start, test, simd.write_counts))

@@ -10,7 +10,7 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.boxes import ROUNDING_DOWN
-from warp_abtree.kernels.base.counters import add_warp_sum
+from warp_abtree.kernels.base.counters import add_lanes
 from warp_abtree.kernels.base.lanes import (
     warp_any,
     warp_lane,
@@ -264,8 +264,8 @@ def search_warp_kernel(
             lists.end = start_search_items(slot, trees.states, search.pose, work_inout)
             lists.open_ready = OPEN_LENGTH - warp_size() + 1
             search_items_nearest(trees, given, search, lists)
-            add_warp_sum(hits_inout.node_tests, p, search.nodes)
-            add_warp_sum(hits_inout.triangle_tests, p, search.faces)
+            add_lanes(hits_inout.node_tests, p, wp.int64(search.nodes))
+            add_lanes(hits_inout.triangle_tests, p, wp.int64(search.faces))
         ended += 1
         p = count
         if slot < 0:

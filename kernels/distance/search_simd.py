@@ -9,7 +9,7 @@ between those that may be the nearest. It is the same answer that warps give on 
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.distance.frame import (
@@ -59,8 +59,7 @@ def open_search(
 
 @native.func_native(cpu=True)
 def search_nearest(
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     scaling: SearchScale,
     terms: wp.vec4,
@@ -153,9 +152,7 @@ def search_pair(
     )
     tests, searching = PairTests(), bool(True)
     while searching:
-        searching = search_nearest(
-            trees.models, trees.states, pose, scaling, terms, slabs, with_slabs, thread, memory, tests
-        )
+        searching = search_nearest(trees, pose, scaling, terms, slabs, with_slabs, thread, memory, tests)
         decide_waiting(trees, pose, scaling, thread, memory, nearest)
     hits.node_tests[p] += wp.int64(tests.nodes)
     hits.triangle_tests[p] += wp.int64(tests.faces)

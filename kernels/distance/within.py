@@ -15,13 +15,12 @@ from warp_abtree.kernels.base.lanes import warp_lane, warp_sync
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.exact.predicates import EXACT
 from warp_abtree.kernels.intersect.dual_tree import add_pair_tests, pair_has_hit
-from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, OUTPUT_COUNT, Hits, test_faces
+from warp_abtree.kernels.intersect.face_pairs import Hits, test_faces
 from warp_abtree.kernels.intersect.relative_pose import pairs_starter
 from warp_abtree.kernels.intersect.simd import write_counts
-from warp_abtree.kernels.search.item import item_first, item_second
-from warp_abtree.kernels.search.load_balance import Work
-from warp_abtree.kernels.search.thread_search import FaceTests, ThreadPolicy, thread_search
-from warp_abtree.kernels.search.warp_search import TraversalTests, WarpPolicy, warp_search
+from warp_abtree.kernels.search.item import OUTPUT_ANY, OUTPUT_COUNT, item_first, item_second
+from warp_abtree.kernels.search.thread_search import FaceLists, FaceTests, ThreadPolicy, thread_search
+from warp_abtree.kernels.search.warp_search import WarpPolicy, warp_search
 from warp_abtree.kernels.search.warp_stack import (
     STACK_LENGTH,
     STRADDLING_START,
@@ -76,21 +75,7 @@ def warp_within(question: Question):
     visit, for_any, found_type = question.visit, question.for_any, found_struct(question.own)
 
     @wp.func
-    def try_small(
-        output: wp.int32,
-        slot: wp.int32,
-        task: wp.vec3i,
-        count: wp.int32,
-        trees: Trees,
-        pose: PairPose,
-        items: wp.uint64,
-        found: found_type,
-        work: Work,
-    ):
-        return task[2]
-
-    @wp.func
-    def separate(own: wp.ref[WarpLists], popped: wp.int32, trees: Trees, pose: PairPose):
+    def separate(mode: wp.int32, own: wp.ref[WarpLists], popped: wp.int32, trees: Trees, pose: PairPose):
         """Let leaf pairs wait as straddling pairs."""
         lane = warp_lane()
         own.leaf_pairs -= popped
@@ -100,6 +85,7 @@ def warp_within(question: Question):
 
     @wp.func
     def test(
+        mode: wp.int32,
         output: wp.int32,
         own: wp.ref[WarpLists],
         popped: wp.int32,
@@ -119,16 +105,8 @@ def warp_within(question: Question):
         warp_sync()
         return is_hit, False
 
-    @wp.func
-    def has_hit(pair: wp.int32, found: found_type):
-        return pair_has_hit(pair, found.hits)
-
-    @wp.func
-    def add_tests(pair: wp.int32, tests: TraversalTests, found: found_type):
-        add_pair_tests(pair, tests, found.hits)
-
     return warp_search(
-        WarpPolicy(question.headers, for_any, True, found_type, try_small, separate, test, has_hit, add_tests)
+        WarpPolicy(question.headers, 0, for_any, True, found_type, None, separate, test, pair_has_hit, add_pair_tests)
     )
 
 
@@ -136,18 +114,6 @@ def warp_within(question: Question):
 def thread_within(question: Question):
     """Return the kernel whose threads share the object pairs."""
     visit, for_any, found_type = question.visit, question.for_any, found_struct(question.own)
-    start_pairs = pairs_starter(True)
-
-    @wp.func
-    def start(
-        output: wp.int32,
-        trees: Trees,
-        batch: PairBatch,
-        within: wp.array(dtype=wp.float64),
-        found: found_type,
-        work: Work,
-    ):
-        start_pairs(output, trees, batch, within, found.hits, work)
 
     @wp.func
     def test(
@@ -155,32 +121,26 @@ def thread_within(question: Question):
         trees: Trees,
         batch: PairBatch,
         pair: wp.int32,
-        waiting: wp.int32,
-        faces: wp.array(dtype=wp.int64),
-        uncertain: wp.array(dtype=wp.int64),
-        apart: wp.array(dtype=wp.int64),
+        lists: wp.ref[FaceLists],
         found: found_type,
         tests: wp.ref[FaceTests],
     ):
         """Visit face pairs, one after the other."""
         met = wp.int32(0)
-        for i in range(waiting):
+        for i in range(lists.waiting):
             if not wp.static(for_any) or met == 0:
                 tests.total += wp.int64(1)
-                faces_of_pair = wp.vec2i(item_first(faces[i]), item_second(faces[i]))
-                if visit(pair, faces_of_pair, trees, batch.poses[pair], found.own):
+                faces = wp.vec2i(item_first(lists.faces[i]), item_second(lists.faces[i]))
+                if visit(pair, faces, trees, batch.poses[pair], found.own):
                     met += 1
         if met > 0:
             found.hits.any_hit[pair] = 1
         tests.hits += wp.int64(met)
         return met
 
-    @wp.func
-    def write(p: wp.int32, node_tests: wp.int64, tests: FaceTests, found: found_type):
-        write_counts(p, node_tests, tests, found.hits)
-
-    policy = ThreadPolicy(question.headers, not for_any, False, found_type, start, test, write)
-    return thread_search(policy, int(OUTPUT_ANY))
+    start = pairs_starter(True)
+    policy = ThreadPolicy(question.headers, not for_any, False, found_type, start, test, write_counts)
+    return thread_search(policy)
 
 
 # Headers that visits need which ask for distances.

@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import LAST_KEY, ObjectPool, pair_key
-from warp_abtree.kernels.base.counters import take_slots
+from warp_abtree.kernels.base.counters import take_together
 from warp_abtree.kernels.base.lanes import (
     WARP_SIZE,
     count_lanes,
@@ -115,11 +115,9 @@ def list_columns(
         word: The lanes whose columns meet its row, a bit each.
         count: How many these are.
     """
-    end, lane, total = wp.int32(0), warp_lane(), warp_sum(count)
+    lane, total = warp_lane(), warp_sum(count)
     if total > 0:
-        if lane == 0:
-            end = take_slots(boxes.pair_count, total)
-        end = hold_uniform(end)
+        end = take_together(boxes.pair_count, 0, total)
         rows = vote_lanes(count > 0)
         while rows != wp.uint32(0):
             k = lowest_bit(wp.int32(rows))

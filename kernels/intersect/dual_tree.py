@@ -1,36 +1,36 @@
 """Face pairs that intersect, or are nearer than a gap: policies of the search by warps."""
 
 import functools
+from typing import Any
 
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import Trees
-from warp_abtree.kernels.base.counters import add_warp_sum
+from warp_abtree.kernels.base.counters import add_lanes
 from warp_abtree.kernels.base.lanes import warp_lane
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.exact.predicates import EXACT
-from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, Hits
+from warp_abtree.kernels.intersect.face_pairs import FoundHits
 from warp_abtree.kernels.intersect.leaf_pairs import separate_leaf_pairs, test_straddling
 from warp_abtree.kernels.intersect.small_trees import SmallLists, gather_leaves, is_small, test_small_trees
 from warp_abtree.kernels.search.load_balance import Work, parts_at_once
 from warp_abtree.kernels.search.warp_search import TraversalTests, WarpPolicy, warp_search
-from warp_abtree.kernels.search.warp_stack import WarpLists
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-def pair_has_hit(pair: wp.int32, found: Hits):
-    return found.any_hit[pair] != 0
+def pair_has_hit(pair: wp.int32, found: Any):
+    return found.hits.any_hit[pair] != 0
 
 
 @wp.func
-def add_pair_tests(pair: wp.int32, tests: TraversalTests, found: Hits):
+def add_pair_tests(pair: wp.int32, tests: TraversalTests, found: Any):
     """Add the tests of a lane to those of its pair. For all lanes."""
-    add_warp_sum(found.node_tests, pair, tests.nodes)
-    add_warp_sum(found.count, pair, tests.hits)
-    add_warp_sum(found.triangle_tests, pair, wp.where(warp_lane() == 0, tests.faces, 0))
-    add_warp_sum(found.float64_tests, pair, tests.uncertain)
+    add_lanes(found.hits.node_tests, pair, wp.int64(tests.nodes))
+    add_lanes(found.hits.count, pair, wp.int64(tests.hits))
+    add_lanes(found.hits.triangle_tests, pair, wp.int64(wp.where(warp_lane() == 0, tests.faces, 0)))
+    add_lanes(found.hits.float64_tests, pair, wp.int64(tests.uncertain))
 
 
 @functools.cache
@@ -50,40 +50,32 @@ def hit_policy(mode: int, for_any: bool) -> WarpPolicy:
         trees: Trees,
         pose: PairPose,
         items: wp.uint64,
-        found: Hits,
+        found: FoundHits,
         work: Work,
     ):
         """Compare all leaves of two small trees; return 0, or the parts of a pair for the search."""
         lists = SmallLists()
-        if wp.static(mode == int(EXACT)):
-            if slot < 0 and is_small(pose, work.small_faces):
-                task[2] = parts_at_once(task[2], count, work.warps)
-                lists = gather_leaves(task, items, trees.states, pose)
+        if slot < 0 and is_small(pose, work.small_faces):
+            task[2] = parts_at_once(task[2], count, work.warps)
+            lists = gather_leaves(task, items, trees.states, pose)
         if lists.fits:
-            asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
-            test_small_trees(asked, wp.static(for_any), task, lists, trees, pose, items, found)
+            test_small_trees(output, wp.static(for_any), task, lists, trees, pose, items, found.hits)
         return wp.where(lists.fits, 0, task[2])
 
-    @wp.func
-    def separate(own: wp.ref[WarpLists], popped: wp.int32, trees: Trees, pose: PairPose):
-        separate_leaf_pairs(wp.static(mode), own, popped, trees, pose)
-
-    @wp.func
-    def test(
-        output: wp.int32,
-        own: wp.ref[WarpLists],
-        popped: wp.int32,
-        pair: wp.int32,
-        trees: Trees,
-        pose: PairPose,
-        found: Hits,
-    ):
-        asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
-        return test_straddling(asked, wp.static(mode), own, popped, pair, trees, pose, found)
-
     headers = ("intersect/small_trees.cuh", "triangle/float32_filter.cuh")
-    within = mode != int(EXACT)
-    return WarpPolicy(headers, for_any, within, Hits, try_small, separate, test, pair_has_hit, add_pair_tests)
+    exact = mode == int(EXACT)
+    return WarpPolicy(
+        headers,
+        mode,
+        for_any,
+        not exact,
+        FoundHits,
+        try_small if exact else None,
+        separate_leaf_pairs,
+        test_straddling,
+        pair_has_hit,
+        add_pair_tests,
+    )
 
 
 def warp_traversal(mode: int, for_any: bool):

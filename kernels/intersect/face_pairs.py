@@ -19,10 +19,6 @@ from warp_abtree.kernels.triangle.signs import have_one_side, rotate_corners
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-OUTPUT_ANY = wp.constant(0)
-OUTPUT_COUNT = wp.constant(1)
-OUTPUT_FACES = wp.constant(2)
-
 # In place of a precision: EXACT, and face pairs that are apart by less than a gap are listed too.
 GAP = wp.constant(-2)
 
@@ -61,6 +57,13 @@ class Hits:
     apart: wp.array(dtype=wp.vec3i)  # as `uncertain`: pairs that are apart and may be near, shape [capacity]
     apart_total: wp.array(dtype=wp.int32)  # numbers `apart`
     witness_total: wp.array(dtype=wp.int32)  # rows that face pairs are reduced to, shape [1]; [0] where they are not
+
+
+@wp.struct
+class FoundHits:
+    """What a search for hits finds; searches for more have such a struct of their own."""
+
+    hits: Hits  # of each pair
 
 
 @wp.func

@@ -13,15 +13,14 @@ from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.exact.predicates import UNCERTAIN
 from warp_abtree.kernels.intersect.face_pairs import (
     GAP,
-    OUTPUT_FACES,
-    Hits,
+    FoundHits,
     defer_uncertain,
     face_plane_signs,
     intersect_straddling_faces,
     list_apart,
     report_hit,
 )
-from warp_abtree.kernels.search.item import item_first, item_second
+from warp_abtree.kernels.search.item import OUTPUT_FACES, item_first, item_second
 from warp_abtree.kernels.search.warp_stack import (
     STACK_LENGTH,
     STRADDLING_START,
@@ -55,20 +54,20 @@ def separate_leaf_pairs(
 
 @wp.func
 def test_straddling(
-    output: wp.int32,
     mode: wp.int32,
+    output: wp.int32,
     own: wp.ref[WarpLists],
     popped: wp.int32,
     pair: wp.int32,
     trees: Trees,
     pose: PairPose,
-    hits: Hits,
+    found: FoundHits,
 ):
     """Test straddling pairs, one a lane; return whether this lane's meets, and whether it is uncertain.
 
     With a gap pairs straddle that no plane parts by more than that, and those that are apart are listed.
     """
-    lane = warp_lane()
+    lane, hits = warp_lane(), found.hits
     own.straddling -= popped
     at = own.straddling + wp.min(lane, popped - 1)
     item = read_item(own.items, STRADDLING_START + at)
@@ -81,14 +80,14 @@ def test_straddling(
             list_apart(slot, pair, item_first(item), item_second(item), hits)
     meet = wp.where(lane < popped, meet, 0)
     warp_sync()
-    found = meet == 1
+    meets = meet == 1
     if output == OUTPUT_FACES:
-        slot = reserve_slot(hits.total, found)
-        if found:
+        slot = reserve_slot(hits.total, meets)
+        if meets:
             report_hit(slot, pair, pose.swapped, item_first(item), item_second(item), hits)
-    if found:
+    if meets:
         hits.any_hit[pair] = 1
     slot = reserve_slot(hits.uncertain_total, meet == UNCERTAIN)
     if meet == UNCERTAIN:
         defer_uncertain(slot, pair, item_first(item), item_second(item), hits)
-    return found, meet == UNCERTAIN
+    return meets, meet == UNCERTAIN

@@ -7,7 +7,7 @@ by what `triangle_distance` errs by. So what is found depends on its bits alone,
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.boxes import ROUNDING_UP
 from warp_abtree.kernels.base.counters import count_flags, reserve_slot, take_slots
 from warp_abtree.kernels.base.lanes import warp_lane, warp_size, warp_sync
@@ -15,6 +15,7 @@ from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.exact.predicates import EXACT
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits, report_hit, test_faces
 from warp_abtree.kernels.search.item import item_first, item_second
+from warp_abtree.kernels.search.thread_search import FaceLists
 from warp_abtree.kernels.search.warp_stack import push_signed_pair, read_signed_pair, signed_pairs
 from warp_abtree.kernels.triangle.corners import load_triangles
 from warp_abtree.kernels.triangle.distance_bounds import bound_faces, load_points
@@ -26,9 +27,7 @@ ERROR_MAX, NEAR_GAP_MAX = wp.constant(wp.float32(2.0**20)), wp.constant(wp.float
 
 
 @native.func_native(cpu=True)
-def simd_near_filter(
-    models: ModelPool, states: StatePool, pose: PairPose, waiting: wp.int32, faces: wp.array(dtype=wp.int64)
-) -> wp.int32:
+def simd_near_filter(trees: Trees, pose: PairPose, waiting: wp.int32, faces: wp.array(dtype=wp.int64)) -> wp.int32:
     """Drop the face pairs that float32 proves farther apart than `within`, 16 at a time; return how many are left."""
 
 
@@ -39,33 +38,23 @@ def are_near(trees: Trees, pose: PairPose, gap: wp.float64, face_a: wp.int32, fa
 
 
 @wp.func
-def part_uncertain(
-    trees: Trees,
-    pose: PairPose,
-    count: wp.int32,
-    uncertain: wp.array(dtype=wp.int64),
-    met: wp.ref[wp.int32],
-    apart: wp.ref[wp.int32],
-    met_inout: wp.array(dtype=wp.int64),
-    apart_inout: wp.array(dtype=wp.int64),
-):
+def part_uncertain(trees: Trees, pose: PairPose, lists: wp.ref[FaceLists]):
     """Decide inexact face pairs by exact signs, and add each to those that have met or to those that are apart."""
-    for i in range(count):
-        item = uncertain[i]
+    for i in range(lists.uncertain):
+        item = lists.uncertain_faces[i]
         if test_faces(EXACT, trees, pose, item_first(item), item_second(item)) == 1:
-            met_inout[met] = item
-            met += 1
+            lists.faces[lists.met] = item
+            lists.met += 1
         else:
-            apart_inout[apart] = item
-            apart += 1
+            lists.apart_faces[lists.apart] = item
+            lists.apart += 1
 
 
 @wp.func(inline=False)
-def report_near(
-    trees: Trees, pose: PairPose, pair: wp.int32, waiting: wp.int32, apart: wp.array(dtype=wp.int64), hits: Hits
-):
-    """Report the face pairs of a list that are nearer than the gap; return how many. For threads of the CPU."""
-    left = simd_near_filter(trees.models, trees.states, pose, waiting, apart)
+def report_near(trees: Trees, pose: PairPose, pair: wp.int32, lists: FaceLists, hits: Hits):
+    """Report the face pairs that are apart and nearer than the gap; return how many. For threads of the CPU."""
+    apart = lists.apart_faces
+    left = simd_near_filter(trees, pose, lists.apart, apart)
     near = wp.int32(0)
     for i in range(left):
         item = apart[i]

@@ -1,6 +1,7 @@
 """Start of a traversal: the relative pose of each object pair, and its counters at 0."""
 
 import functools
+from typing import Any
 
 import warp as wp
 
@@ -9,8 +10,9 @@ from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.generation import record_launch
 from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.base.poses import PairBatch, pair_pose
-from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, Hits
+from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.intersect.small_trees import is_small
+from warp_abtree.kernels.search.item import OUTPUT_ANY
 from warp_abtree.kernels.search.load_balance import NO_UNIT, Work, note_descent, units_per_pair
 from warp_abtree.kernels.triangle.distance import DISTANCE_MAX, pad_distance
 
@@ -111,18 +113,18 @@ def relative_poses(with_distances: bool):
 
 @functools.cache
 def pairs_starter(with_distances: bool):
-    """Return the function by which one thread starts all pairs, as the kernels of `relative_poses` do."""
+    """Return the function by which one thread starts all pairs, as `relative_poses` do; what is found has `hits`."""
     start_pose = pose_starter(with_distances)
 
     @wp.func
     def start_pairs(
-        output: wp.int32, trees: Trees, batch: PairBatch, within: wp.array(dtype=wp.float64), hits: Hits, work: Work
+        output: wp.int32, trees: Trees, batch: PairBatch, within: wp.array(dtype=wp.float64), found: Any, work: Work
     ):
         room = batch.pairs.shape[0]
         count = wp.min(batch.count[0], room)
         clear_work(count, work)
         for p in range(room):
-            clear_hits(p, hits)
+            clear_hits(p, found.hits)
         for p in range(count):
             start_pose(p, output, trees, batch, within, work)
 

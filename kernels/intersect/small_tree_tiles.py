@@ -9,7 +9,7 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.boxes import map_point
-from warp_abtree.kernels.base.counters import reserve_slot
+from warp_abtree.kernels.base.counters import reserve_slot, take_together
 from warp_abtree.kernels.base.lanes import (
     count_lanes,
     first_lane,
@@ -23,7 +23,8 @@ from warp_abtree.kernels.base.lanes import (
 from warp_abtree.kernels.base.nodes import load_constant_node
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.exact.predicates import UNCERTAIN
-from warp_abtree.kernels.intersect.face_pairs import OUTPUT_FACES, Hits, defer_uncertain, report_hit
+from warp_abtree.kernels.intersect.face_pairs import Hits, defer_uncertain, report_hit
+from warp_abtree.kernels.search.item import OUTPUT_FACES
 from warp_abtree.kernels.search.warp_search import TraversalTests
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_near
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, are_uncertain, intersect_straddling, plane_signs
@@ -64,11 +65,6 @@ def compare_boxes(
     items: wp.uint64, rows: wp.int32, lower: wp.vec3, upper: wp.vec3, posed_lower: wp.vec3, posed_upper: wp.vec3
 ) -> wp.uint32:
     """Return a bit for each of the first leaves of A in place whose boxes overlap those of a leaf of B."""
-
-
-@native.func_native()
-def reserve_run(total: wp.array(dtype=wp.int32), count: wp.int32) -> wp.int32:
-    """Add the same number of all lanes to total[0]; return its value before."""
 
 
 @native.func_native()
@@ -227,7 +223,7 @@ def test_faces_in_place(items: wp.uint64, error: wp.float32, pair: wp.int32, liv
 def report_tile_hits(items: wp.uint64, first: wp.int32, count: wp.int32, pair: wp.int32, swapped: wp.int32, hits: Hits):
     """Report so many of the hits that wait, one a lane."""
     warp_sync()
-    slot = reserve_run(hits.total, count) + warp_lane()
+    slot = take_together(hits.total, 0, count) + warp_lane()
     if warp_lane() < count:
         faces = read_half(items, TILE_HITS + first + warp_lane())
         face_a, face_b = face_in_place(items, corners_of_a(faces)), face_in_place(items, corners_of_b(faces))

@@ -12,7 +12,8 @@ from warp_abtree.kernels.base.counters import count_flags, reserve_slot
 from warp_abtree.kernels.base.lanes import RESOLVE_WARPS, WARP_SIZE, resolve_lane, warp_size, warp_sync
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.exact.predicates import EXACT, FLOAT32, UNCERTAIN
-from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, OUTPUT_FACES, Hits, list_apart, report_hit, test_faces
+from warp_abtree.kernels.intersect.face_pairs import Hits, list_apart, report_hit, test_faces
+from warp_abtree.kernels.search.item import OUTPUT_ANY, OUTPUT_FACES
 from warp_abtree.kernels.search.warp_stack import push_signed_pair, read_signed_pair, signed_pairs
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair
 from warp_abtree.kernels.triangle.float64_filter import (

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
-from warp_abtree.kernels.base.counters import add_warp_sum
+from warp_abtree.kernels.base.counters import add_lanes
 from warp_abtree.kernels.base.generation import STALE
 from warp_abtree.kernels.base.lanes import next_place, warp_any, warp_lane, warp_min, warp_size, warp_sync
 from warp_abtree.kernels.intersect.face_pairs import Hits
@@ -202,8 +202,8 @@ def warp_motion_search(kind):
             p = first + k
             if k < size and p < count:
                 if contacts_inout.end[p] == OPEN:
-                    add_warp_sum(hits_inout.node_tests, p, group.nodes[k])
-                    add_warp_sum(hits_inout.triangle_tests, p, group.faces[k])
+                    add_lanes(hits_inout.node_tests, p, wp.int64(group.nodes[k]))
+                    add_lanes(hits_inout.triangle_tests, p, wp.int64(group.faces[k]))
                     warp_sync()
                     if warp_lane() == 0:
                         contacts_inout.time[p] = group.time[k]

@@ -8,7 +8,7 @@ that node pair tests are the same in every launch.
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool, Trees
+from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.poses import PairPose
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -80,18 +80,12 @@ def move_below(descent: wp.ref[Descent], stack: wp.array(dtype=wp.int64), below:
 
 
 @native.func_native(cpu=True)
-def slab_cost(models: ModelPool, states: StatePool, pose: PairPose, repeats: wp.int32) -> wp.int64:
+def slab_cost(trees: Trees, pose: PairPose, repeats: wp.int32) -> wp.int64:
     """Estimate the cost of an object pair's slabs in node pair tests, for an A of one pair before it or two."""
 
 
 @native.func_native(cpu=True)
-def open_subtrees(
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    descent: wp.ref[Descent],
-    memory: wp.array2d(dtype=wp.float32),
-):
+def open_subtrees(trees: Trees, pose: PairPose, descent: wp.ref[Descent], memory: wp.array2d(dtype=wp.float32)):
     """Choose the slab directions of an object pair, and its floors, see `move_below`.
 
     Directions and slabs of A stay for the next pair with it, in this launch or a later one.
@@ -100,8 +94,7 @@ def open_subtrees(
 
 @native.func_native(cpu=True)
 def descend_subtrees(
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pose: PairPose,
     descent: wp.ref[Descent],
     below: wp.array(dtype=wp.int64),
@@ -153,7 +146,7 @@ def should_build_slabs(trees: Trees, pose: PairPose, hit_count: wp.int64, descen
     if tested >= descent.plain_tests and hit_count * NODE_TESTS_A_HIT <= tested:
         return True
     if descent.cost < wp.int64(0):
-        descent.cost = slab_cost(trees.models, trees.states, pose, descent.repeats)
+        descent.cost = slab_cost(trees, pose, descent.repeats)
     if tested >= descent.cost and hit_count * NODE_TESTS_A_DENSE_HIT <= tested:
         return True
     descent.looks = tested * wp.int64(2)
@@ -178,13 +171,13 @@ def advance(
     """Descend until leaf pairs wait; return how many. Boxes decide until slabs are made; then these, below floors."""
     if descent.top > 0 and descent.tests >= descent.looks:
         if should_build_slabs(trees, pose, hit_count, descent):
-            open_subtrees(trees.models, trees.states, pose, descent, memory)
+            open_subtrees(trees, pose, descent, memory)
             descent.looks = NEVER
     plain = descent.floors[0] == NO_FLOOR
     if not plain and descent.deep == 0:
         move_below(descent, stack, below)
     if descent.deep > 0:
-        return descend_subtrees(trees.models, trees.states, pose, descent, below, memory, faces)
+        return descend_subtrees(trees, pose, descent, below, memory, faces)
     most = wp.where(plain, descent.looks - descent.tests, wp.int64(1))
     return descend(trees.states, pose, most, descent, stack, faces)
 

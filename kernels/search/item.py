@@ -24,6 +24,9 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 # What a pair of children is: dropped, to go on with, or two faces.
 DROPPED, NODES, FACES = wp.constant(0), wp.constant(1), wp.constant(2)
 
+# What is asked of an object pair: whether there is a hit, how many, or which face pairs.
+OUTPUT_ANY, OUTPUT_COUNT, OUTPUT_FACES = wp.constant(0), wp.constant(1), wp.constant(2)
+
 INDEX_MASK = wp.constant(2**31 - 1)
 # The lists of a warp that overlapping children are for, see `push_children`.
 TO_STACK, TO_LEAF_PAIRS = native.constant("STACK_LIST"), native.constant("LEAF_PAIR_LIST")

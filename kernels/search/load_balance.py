@@ -21,6 +21,7 @@ The word of `load_tickets`, from two counters side by side:
 import warp as wp
 
 from warp_abtree.kernels import native
+from warp_abtree.kernels.base.counters import take_once, take_together
 from warp_abtree.kernels.base.generation import LaunchRecord
 from warp_abtree.kernels.base.lanes import hold_uniform, warp_lane, warp_size, warp_sync
 from warp_abtree.kernels.base.poses import PairPose
@@ -40,6 +41,8 @@ SLOT_ITEMS = native.constant("SLOT_ITEMS")
 DONATIONS_AT_ONCE = wp.constant(3)
 COUNTER_COUNT = 5
 
+# The counter of units that are taken.
+UNITS_TAKEN = wp.constant(3)
 NO_UNIT = native.constant("NO_UNIT")
 # The bit of half an item that names two siblings.
 SIBLINGS = wp.constant(-(2**31))
@@ -70,14 +73,10 @@ def first_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
     """Return the unit that this warp starts with, NO_UNIT or more where there is no work."""
 
 
-@native.func_native()
-def take_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
+@wp.func
+def take_unit(counter: wp.array(dtype=wp.int32)):
     """Return the number of a unit of work that no other warp has; from the number of units on there is none."""
-
-
-@native.func_native()
-def claim_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
-    """Take a unit as `take_unit`, in the first lane alone, without waiting for the atomic."""
+    return take_together(counter, UNITS_TAKEN, 1)
 
 
 @native.func_native()
@@ -140,7 +139,7 @@ def claim_ahead(ended: wp.int32, unit: wp.int32, units: wp.int32, work: Work):
     if ended < 0:
         claimed = units
         if units > work.warps:
-            claimed = claim_unit(work.counter)
+            claimed = take_once(work.counter, UNITS_TAKEN, 1)
     return claimed
 
 

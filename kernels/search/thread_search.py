@@ -23,7 +23,7 @@ from warp_abtree.kernels.search.descent import (
     shuffle_stack,
     start_descent,
 )
-from warp_abtree.kernels.search.item import first_item
+from warp_abtree.kernels.search.item import OUTPUT_ANY, first_item
 from warp_abtree.kernels.search.load_balance import Work, take_thread, take_unit
 
 THREAD_HEADERS = (
@@ -57,6 +57,32 @@ class FaceTests:
     exact: wp.int64  # those that took exact signs
 
 
+@wp.struct
+class FaceLists:
+    """Leaf pairs that wait, and face pairs that filters leave: lists, each with room for 16 more, and their lengths."""
+
+    faces: wp.array(dtype=wp.int64)  # leaf pairs; those that meet take their place, from the first on
+    uncertain_faces: wp.array(dtype=wp.int64)  # those that another filter or exact signs decide
+    apart_faces: wp.array(dtype=wp.int64)  # those that are apart, perhaps nearer than a gap; [1] where none are listed
+    waiting: wp.int32  # leaf pairs
+    met: wp.int32  # face pairs that meet
+    uncertain: wp.int32  # uncertain ones
+    apart: wp.int32  # those that are apart
+    tested: wp.int32  # those that the last filter looked at
+
+
+@wp.func
+def make_lists(
+    faces: wp.array(dtype=wp.int64), uncertain_faces: wp.array(dtype=wp.int64), apart_faces: wp.array(dtype=wp.int64)
+):
+    """Return empty lists in memory of a thread."""
+    lists = FaceLists()
+    lists.faces = faces
+    lists.uncertain_faces = uncertain_faces
+    lists.apart_faces = apart_faces
+    return lists
+
+
 class ThreadPolicy(NamedTuple):
     """What a search by threads asks of face pairs: functions of a thread, and what they write.
 
@@ -66,8 +92,7 @@ class ThreadPolicy(NamedTuple):
         lists_apart: Whether face pairs that are apart have a list.
         found: Struct of what is found.
         start: (output, trees, batch, within, found, work): starts all pairs.
-        test: (output, trees, batch, pair, waiting, faces, uncertain, apart, found, tests) -> hits among so many leaf
-            pairs that wait.
+        test: (output, trees, batch, pair, lists, found, tests) -> hits among the leaf pairs that wait.
         write: (pair, node tests, tests, found): writes the counts of a pair.
     """
 
@@ -81,8 +106,8 @@ class ThreadPolicy(NamedTuple):
 
 
 @functools.cache
-def thread_search(policy: ThreadPolicy, output_any: int):
-    """Return the kernel whose threads share the object pairs; one hit ends a pair for one of the outputs."""
+def thread_search(policy: ThreadPolicy):
+    """Return the kernel whose threads share the object pairs."""
     start_pairs, test, write_counts, found_type = policy.start, policy.test, policy.write, policy.found
     builds_slabs, apart_length = policy.builds_slabs, WAITING_LENGTH if policy.lists_apart else 1
 
@@ -108,7 +133,8 @@ def thread_search(policy: ThreadPolicy, output_any: int):
         faces = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
         uncertain = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
         apart = wp.zeros(shape=wp.static(apart_length), dtype=wp.int64)
-        for_any = output == wp.static(output_any)
+        lists = make_lists(faces, uncertain, apart)
+        for_any = output == OUTPUT_ANY
         descent = Descent()
         descent.thread = take_thread(work_inout.counter)
         p = take_unit(work_inout.counter)
@@ -120,8 +146,8 @@ def thread_search(policy: ThreadPolicy, output_any: int):
             start_descent(for_any, plain, count_repeats(p, batch_inout.poses), descent)
             tests = FaceTests()
             while descent.top > 0 or descent.deep > 0:
-                waiting = advance(trees, pose, tests.hits, descent, stack, below, memory_inout, faces)
-                met = test(output, trees, batch_inout, p, waiting, faces, uncertain, apart, found_inout, tests)
+                lists.waiting = advance(trees, pose, tests.hits, descent, stack, below, memory_inout, faces)
+                met = test(output, trees, batch_inout, p, lists, found_inout, tests)
                 if for_any:
                     shuffle_stack(met, descent, stack)
             write_counts(p, descent.tests, tests, found_inout)

@@ -15,7 +15,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import StatePool, Trees
 from warp_abtree.kernels.base.lanes import WARP_SIZE, hold_uniform, warp_any, warp_lane, warp_size, warp_sync
 from warp_abtree.kernels.base.poses import NO_NODE, PairBatch, PairPose
-from warp_abtree.kernels.search.item import compare_node_pair
+from warp_abtree.kernels.search.item import OUTPUT_ANY, compare_node_pair
 from warp_abtree.kernels.search.load_balance import (
     DEPTH_FIRST_ROOM,
     STACK_MASK,
@@ -82,23 +82,25 @@ class WarpPolicy(NamedTuple):
     Attributes:
         headers: Headers that the functions need beside those of the search.
         for_any: Whether one hit ends a pair.
+        mode: What `separate` and `test` are given first.
         within: Whether faces nearer than a distance are asked for, not only those that meet. Then warps give work away
             whatever the sizes of trees are.
         found: Struct of what is found.
         try_small: (output, slot, task, count, trees, pose, items, found, work) -> the parts of a pair for the search,
-            of a task (pair, part, parts), 0 where the part is done.
-        separate: (own, popped, trees, pose): takes leaf pairs, and lets some wait as straddling pairs.
-        test: (output, own, popped, pair, trees, pose, found) -> whether this lane's straddling pair is a hit, and
+            of a task (pair, part, parts), 0 where the part is done; None where all go to the search.
+        separate: (mode, own, popped, trees, pose): takes leaf pairs, and lets some wait as straddling pairs.
+        test: (mode, output, own, popped, pair, trees, pose, found) -> whether this lane's straddling pair is a hit, and
             whether it is uncertain.
         has_hit: (pair, found) -> whether a pair has a hit; of policies for any.
         add_tests: (pair, tests, found): adds the tests of a lane to those of its pair.
     """
 
     headers: tuple[str, ...]
+    mode: int
     for_any: bool
     within: bool
     found: Any
-    try_small: Callable
+    try_small: Callable | None
     separate: Callable
     test: Callable
     has_hit: Callable
@@ -193,7 +195,7 @@ def set_pace(stack_room: wp.int32, parts: wp.int32, for_any: bool):
 def items_searcher(policy: WarpPolicy):
     """Return the function by which a warp searches the items on its stack."""
     separate, test, has_hit, add_tests = policy.separate, policy.test, policy.has_hit, policy.add_tests
-    for_any, found_type = policy.for_any, policy.found
+    mode, for_any, found_type = policy.mode, policy.for_any, policy.found
 
     @wp.func
     def search_items(
@@ -224,11 +226,11 @@ def items_searcher(policy: WarpPolicy):
             empty = own.end == own.head and own.slab_pairs == 0
             if own.leaf_pairs >= ready or (empty and own.leaf_pairs > 0):
                 popped = wp.min(own.leaf_pairs, warp_size())
-                separate(own, popped, trees, pose)
+                separate(wp.static(mode), own, popped, trees, pose)
                 tests.faces += popped
             if own.straddling >= ready_straddling or (empty and own.leaf_pairs == 0 and own.straddling > 0):
                 popped = wp.min(own.straddling, warp_size())
-                is_hit, uncertain = test(output, own, popped, pair, trees, pose, found)
+                is_hit, uncertain = test(wp.static(mode), output, own, popped, pair, trees, pose, found)
                 tests.hits += wp.where(is_hit, 1, 0)
                 tests.uncertain += wp.where(uncertain, 1, 0)
             idle = count_idle(tickets)
@@ -262,6 +264,8 @@ def warp_search(policy: WarpPolicy):
         work_inout: Work,
     ):
         """Search units of work, each a part of one object pair, and donated items, until there are none."""
+        # Which the compiler then knows.
+        asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
         count = wp.min(batch.count[0], batch.poses.shape[0])
         ended = first_ended(wp.static(within), work_inout.counter)
         unit = first_unit(work_inout.counter)
@@ -283,13 +287,15 @@ def warp_search(policy: WarpPolicy):
             unit = claim_ahead(ended, unit, units, work_inout)
             pose = batch.poses[p]
             if not wp.static(within):
-                pose.within = wp.float64(0.0)  # which the compiler then knows
-            left = try_small(output, slot, task, count, trees, pose, own.items, found_inout, work_inout)
+                pose.within = wp.float64(0.0)  # so, too
+            left = wp.int32(parts)
+            if wp.static(try_small is not None):
+                left = try_small(asked, slot, task, count, trees, pose, own.items, found_inout, work_inout)
             if left > 0:
                 task[2] = left
                 pose.floor = slab_floor(pose, parts)
                 own.end = first_items(own.items, slot, task, pose, work_inout)
-                search_items(output, pace, p, trees, pose, own, found_inout, work_inout)
+                search_items(asked, pace, p, trees, pose, own, found_inout, work_inout)
             ended += 1
             unit = next_unit(ended, unit, units, work_inout)
 

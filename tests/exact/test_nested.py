@@ -12,7 +12,7 @@ from helpers.scenes import scene_with
 import warp_abtree as ab
 from warp_abtree import testing
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.search import descent
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
@@ -117,8 +117,7 @@ def test_slabs_that_stay_fit_an_object_of_any_size():
 @wp.kernel
 def list_leaf_pairs_kernel(
     margin_factor: wp.float32,
-    models: ModelPool,
-    states: StatePool,
+    trees: Trees,
     pair_poses: wp.array(dtype=PairPose),
     memory: wp.array2d(dtype=wp.float32),
     stack_inout: wp.array(dtype=wp.int64),
@@ -131,10 +130,10 @@ def list_leaf_pairs_kernel(
     state = descent.Descent()
     state.ready = AT_ONCE
     state.deep = 1
-    descent.open_subtrees(models, states, pose, state, memory)
-    stack_inout[0] = first_item(states, pose)
+    descent.open_subtrees(trees, pose, state, memory)
+    stack_inout[0] = first_item(trees.states, pose)
     while state.deep > 0:
-        for i in range(descent.descend_subtrees(models, states, pose, state, stack_inout, memory, faces_inout)):
+        for i in range(descent.descend_subtrees(trees, pose, state, stack_inout, memory, faces_inout)):
             if item_first(faces_inout[i]) == item_second(faces_inout[i]):
                 met_out[item_first(faces_inout[i])] = 1
 
@@ -145,7 +144,7 @@ def count_lost(query, count, margin_factor):
     lengths = descent.CPU_STACK_LENGTH, descent.WAITING_LENGTH
     buffers = [wp.empty(length, dtype=wp.int64, device=CPU) for length in lengths]
     met = wp.zeros(count, dtype=wp.int32, device=CPU)
-    inputs = [margin_factor, query.batch.models.pool, query.batch.states.pool, query.pair_poses, memory, *buffers, met]
+    inputs = [margin_factor, query.batch.trees, query.pair_poses, memory, *buffers, met]
     wp.launch(list_leaf_pairs_kernel, dim=1, inputs=inputs, device=CPU)
     return int((met.numpy() == 0).sum())
 

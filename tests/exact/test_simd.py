@@ -15,10 +15,11 @@ from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.exact.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.intersect import face_pairs
 from warp_abtree.kernels.intersect.face_pairs import face_plane_signs, intersect_straddling_faces
-from warp_abtree.kernels.intersect.simd import Filtered, simd_float32_filter, simd_float64_filter
+from warp_abtree.kernels.intersect.simd import simd_float32_filter, simd_float64_filter
 from warp_abtree.kernels.search import descent
 from warp_abtree.kernels.search.descent import CPU_STACK_LENGTH, ITEMS_AT_ONCE, WAITING_LENGTH
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
+from warp_abtree.kernels.search.thread_search import FaceLists, make_lists
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT
 from warp_abtree.kernels.triangle.signs import SEPARATED
 
@@ -78,7 +79,7 @@ def float32_one_kernel(mode: int, posed: Posed, items: Items, meet_out: wp.array
 
 
 @wp.func
-def write_filtered(found: Filtered, count: Items):
+def write_filtered(found: FaceLists, count: Items):
     count[0] = wp.int64(found.met)
     count[1] = wp.int64(found.uncertain)
     count[2] = wp.int64(found.tested)
@@ -87,9 +88,9 @@ def write_filtered(found: Filtered, count: Items):
 
 @wp.kernel
 def float32_all_kernel(first_ends: bool, unit: float, posed: Posed, faces_inout: Items, left_out: Items, count: Items):
-    models, states, pose, waiting = posed.trees.models, posed.trees.states, posed.pose, faces_inout.shape[0] - OVER
-    bounds, found = wp.vec3(pose.error, unit, -1.0), Filtered()
-    simd_float32_filter(models, states, pose, bounds, first_ends, waiting, faces_inout, left_out, left_out, found)
+    found = make_lists(faces_inout, left_out, left_out)
+    found.waiting = faces_inout.shape[0] - OVER
+    simd_float32_filter(posed.trees, posed.pose, wp.vec3(posed.pose.error, unit, -1.0), first_ends, found)
     write_filtered(found, count)
 
 
@@ -151,12 +152,11 @@ def float64_all_kernel(
     first_ends: bool, met: int, waiting: int, posed: Posed, left: Items, faces: Items, apart: Items, count: Items
 ):
     """Filter so many face pairs, and list those that are apart where the first that meets does not end it."""
-    models, states, pose = posed.trees.models, posed.trees.states, posed.pose
-    found = Filtered()
+    found = make_lists(faces, left, apart)
     found.met = met
     found.apart = met
     found.uncertain = waiting
-    simd_float64_filter(models, states, pose, first_ends, not first_ends, found, left, faces, apart)
+    simd_float64_filter(posed.trees, posed.pose, first_ends, not first_ends, found)
     write_filtered(found, count)
 
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from warp_abtree.checks.arguments import flag, to_numpy, whole_number
 from warp_abtree.kernels.exact import predicates
-from warp_abtree.kernels.intersect import face_pairs
+from warp_abtree.kernels.search import item
 
-OUTPUTS = {"any": face_pairs.OUTPUT_ANY, "count": face_pairs.OUTPUT_COUNT, "faces": face_pairs.OUTPUT_FACES}
+OUTPUTS = {"any": item.OUTPUT_ANY, "count": item.OUTPUT_COUNT, "faces": item.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.EXACT, "float32": predicates.FLOAT32}
 
 _PRECISION_NAMES = tuple(PRECISIONS)  # found without a hash

@@ -1,6 +1,7 @@
 // Counters and totals in memory, which the lanes of a warp add to by one atomic. On the CPU a warp is one thread.
 #pragma once
 #include "builtin.h"
+#include "base/lanes.cuh"
 
 inline CUDA_CALLABLE wp::int32 reserve_slot(wp::array_t<wp::int32> total, bool flag) {
 #if defined(__CUDA_ARCH__)
@@ -30,20 +31,17 @@ inline CUDA_CALLABLE wp::int32 take_slots(wp::array_t<wp::int32> total, wp::int3
 #endif
 }
 
-inline CUDA_CALLABLE wp::int32 take_turn(wp::array_t<wp::int32> taken, wp::int32 i) {
+inline CUDA_CALLABLE wp::int32 take_once(wp::array_t<wp::int32> counts, wp::int32 i, wp::int32 count) {
 #if defined(__CUDA_ARCH__)
-    int turn = 0;
-    if ((threadIdx.x & 31) == 0)
-        turn = atomicAdd(taken.data + i, 1);
-    return __shfl_sync(0xffffffffu, turn, 0);
+    return resolve_lane() == 0 ? atomicAdd(counts.data + i, count) : 0;
 #else
-    return taken.data[i]++;
+    return __atomic_fetch_add(counts.data + i, count, __ATOMIC_RELAXED);
 #endif
 }
 
 inline CUDA_CALLABLE void wait_for_counts(wp::array_t<wp::int32> counts, wp::vec2i ids, wp::vec2i values) {
 #if defined(__CUDA_ARCH__)
-    const int lane = threadIdx.x & 31, least = lane == 0 ? values[0] : lane == 1 ? values[1] : 0;
+    const int lane = resolve_lane(), least = lane == 0 ? values[0] : lane == 1 ? values[1] : 0;
     int* count = counts.data + (lane == 0 ? ids[0] : ids[1]);
     if (least > 0)
         while (__nv_atomic_load_n(count, __NV_ATOMIC_ACQUIRE, __NV_THREAD_SCOPE_DEVICE) < least)
@@ -54,7 +52,7 @@ inline CUDA_CALLABLE void wait_for_counts(wp::array_t<wp::int32> counts, wp::vec
 
 inline CUDA_CALLABLE void publish_counts(wp::array_t<wp::int32> counts, wp::vec2i ids, wp::vec2i values) {
 #if defined(__CUDA_ARCH__)
-    const int lane = threadIdx.x & 31, value = lane == 0 ? values[0] : lane == 1 ? values[1] : 0;
+    const int lane = resolve_lane(), value = lane == 0 ? values[0] : lane == 1 ? values[1] : 0;
     __syncwarp();
     if (value > 0)
         __nv_atomic_store_n(counts.data + (lane == 0 ? ids[0] : ids[1]), value, __NV_ATOMIC_RELEASE,
@@ -62,15 +60,13 @@ inline CUDA_CALLABLE void publish_counts(wp::array_t<wp::int32> counts, wp::vec2
 #endif
 }
 
-inline CUDA_CALLABLE void add_warp_sum(wp::array_t<wp::int64> totals, wp::int32 i, wp::int32 x) {
+inline CUDA_CALLABLE void add_lanes(wp::array_t<wp::int64> totals, wp::int32 i, wp::int64 x) {
+    const long long sum = sum_lanes((long long)x);
 #if defined(__CUDA_ARCH__)
-    long long sum = x;
-    for (int step = 16; step > 0; step >>= 1)
-        sum += __shfl_down_sync(0xffffffffu, sum, step);
-    if (threadIdx.x == 0 && sum != 0)
+    if (resolve_lane() == 0 && sum != 0)
         atomicAdd((unsigned long long*)totals.data + i, (unsigned long long)sum);
 #else
-    totals.data[i] += x;
+    totals.data[i] += sum;
 #endif
 }
 
@@ -79,7 +75,7 @@ inline CUDA_CALLABLE void count_flags(wp::array_t<wp::int64> totals, wp::int32 i
     if (!__any_sync(0xffffffffu, flag))
         return;
     unsigned int same = __match_any_sync(0xffffffffu, flag ? i : -1);
-    if (flag && (threadIdx.x & 31) + 1 == __ffs(same))
+    if (flag && resolve_lane() == lowest_bit(same))
         atomicAdd((unsigned long long*)totals.data + i, (unsigned long long)__popc(same));
 #else
     if (flag)
@@ -90,7 +86,7 @@ inline CUDA_CALLABLE void count_flags(wp::array_t<wp::int64> totals, wp::int32 i
 inline CUDA_CALLABLE bool ends_launch(wp::array_t<wp::int32> ended, wp::int32 threads) {
 #if defined(__CUDA_ARCH__)
     // The first lane adds for its warp.
-    if ((threadIdx.x & 31) != 0)
+    if (resolve_lane() != 0)
         return false;
     __threadfence();
     if (atomicAdd(ended.data, 1) + 1 != threads / 32)
@@ -102,16 +98,4 @@ inline CUDA_CALLABLE bool ends_launch(wp::array_t<wp::int32> ended, wp::int32 th
 #endif
     ended.data[0] = 0;
     return true;
-}
-
-inline CUDA_CALLABLE void add_lanes(wp::array_t<wp::int64> totals, wp::int32 i, wp::int64 x) {
-#if defined(__CUDA_ARCH__)
-    long long sum = x;
-    for (int step = 16; step > 0; step >>= 1)
-        sum += __shfl_down_sync(0xffffffffu, sum, step);
-    if ((threadIdx.x & 31) == 0 && sum != 0)
-        atomicAdd((unsigned long long*)totals.data + i, (unsigned long long)sum);
-#else
-    totals.data[i] += x;
-#endif
 }

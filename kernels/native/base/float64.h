@@ -32,16 +32,6 @@ struct Float64 : Points64<Lanes64> {
     typedef int ints __attribute__((vector_size(32)));
     typedef int loose_ints __attribute__((vector_size(32), aligned(4)));
     typedef double four __attribute__((vector_size(32), aligned(8)));
-    // Of 8 signs those that are 1, -1 and UNCERTAIN, a bit each.
-    struct Sides {
-        unsigned int above, below, open;
-    };
-    // Of 8 triangles those whose first corner is alone, whose second is, and whose lone corner lies on the negative
-    // side.
-    struct Alone {
-        unsigned int first, second, back;
-    };
-
     static ints widen(unsigned int mask) {
         return -__builtin_convertvector(__builtin_bit_cast(flags, (unsigned char)mask), ints);
     }
@@ -61,51 +51,6 @@ struct Float64 : Points64<Lanes64> {
         return Point{__builtin_shufflevector(low_01, low_23, 0, 1, 4, 5, 8, 9, 12, 13),
                      __builtin_shufflevector(high_01, high_23, 0, 1, 4, 5, 8, 9, 12, 13),
                      __builtin_shufflevector(low_01, low_23, 2, 3, 6, 7, 10, 11, 14, 15)};
-    }
-    static Sides filtered(const lanes& value, const lanes& bound) {
-        const unsigned int above = to_mask(value > bound), below = to_mask(value < -bound);
-        const unsigned int open = 255 & ~(above | below);
-        return Sides{above, below, open & ~to_mask(bound == 0.0)};
-    }
-    static unsigned int one_sided(const Sides (&s)[3]) {
-        return (s[0].above & s[1].above & s[2].above) | (s[0].below & s[1].below & s[2].below);
-    }
-    static unsigned int has_sides(const Sides (&s)[3]) {
-        return (s[0].above | s[0].below) & (s[1].above | s[1].below) & (s[2].above | s[2].below);
-    }
-    static unsigned int has_all_zero(const Sides (&s)[3]) {
-        unsigned int any = 0;
-        for (int i = 0; i < 3; ++i)
-            any |= s[i].above | s[i].below | s[i].open;
-        return ~any;
-    }
-    // As `find_alone`.
-    static Alone find_alone(const Sides (&s)[3]) {
-        const unsigned int pair_above = s[0].above & s[1].above, pair_below = s[0].below & s[1].below;
-        const unsigned int odd_above = s[0].above ^ s[1].above, odd_below = s[0].below ^ s[1].below;
-        const unsigned int positive = (odd_above ^ s[2].above) & ~(pair_above & s[2].above);
-        const unsigned int negative = (odd_below ^ s[2].below) & ~(pair_below & s[2].below) & ~positive;
-        const unsigned int zero = ~(positive | negative);
-        auto is_kind = [&](const Sides& side) {
-            return (positive & side.above) | (negative & side.below) | (zero & ~(side.above | side.below));
-        };
-        const unsigned int two_above = pair_above | (odd_above & s[2].above);
-        return Alone{is_kind(s[0]), is_kind(s[1]), negative | (zero & two_above)};
-    }
-    // The same where none of the corners touches.
-    static Alone find_lone(const Sides (&s)[3]) {
-        const unsigned int odd = s[0].above ^ s[1].above, other = s[1].above ^ s[2].above;
-        return Alone{odd & ~other, odd & other, (s[0].above & s[1].above) | (odd & s[2].above)};
-    }
-    // The corners at a place of three lists, rotated so that the lone one comes first, in either direction.
-    static void rotate(const Alone& alone, unsigned int back, const int* a, const int* b, const int* c, ints* rotated) {
-        const ints corner[3] = {look_up(a), look_up(b), look_up(c)};
-        const ints first = widen(alone.first), second = widen(alone.second), turns_back = widen(back);
-        rotated[0] = first ? corner[0] : second ? corner[1] : corner[2];
-        const ints q = first ? corner[1] : second ? corner[2] : corner[0];
-        const ints r = first ? corner[2] : second ? corner[0] : corner[1];
-        rotated[1] = turns_back ? r : q;
-        rotated[2] = turns_back ? q : r;
     }
     // Put what a mask names on a list, of which eight places are written over. No branch depends on a single pair of
     // faces: it could not be predicted, and what follows it would wait for the longest chain of operations.

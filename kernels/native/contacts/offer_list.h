@@ -4,10 +4,10 @@
 #include "contacts/near_offer.cuh"
 #include "distance/corners32.h"
 
-template <class ModelPool, class StatePool, class PairPose>
-void simd_offer_faces(const ModelPool& models, const StatePool& states, const PairPose& pose, wp::int32 count,
-                      wp::array_t<wp::int64> faces, wp::vec2 bounds, wp::array_t<wp::float32> directions,
-                      wp::vec2i widths, wp::int32 pair, wp::array_t<wp::int64> slots) {
+template <class Trees, class PairPose>
+void simd_offer_faces(const Trees& trees, const PairPose& pose, wp::int32 count, wp::array_t<wp::int64> faces,
+                      wp::vec2 bounds, wp::array_t<wp::float32> directions, wp::vec2i widths, wp::int32 pair,
+                      wp::array_t<wp::int64> slots) {
     typedef NearOffer O;
     const float scale = (float)pose.scale;
     wp::vec3 there;
@@ -17,9 +17,7 @@ void simd_offer_faces(const ModelPool& models, const StatePool& states, const Pa
     for (int first = 0; first < count; first += 16) {
         const wp::int64* items = faces.data + first;
         const int some = count - first < 16 ? count - first : 16;
-        const O::N::Corners corners =
-            NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a, pose.corner_b,
-                                 pose.rotation32.data, there, scale, items, some);
+        const O::N::Corners corners = NearestCorners::load(trees, pose, there, scale, items, some);
         const O::Scores scores = O::rate(corners, bounds[0], bounds[1], directions.data);
         const SlotKeys<O::lanes, O::bits, O::F::integers> keys(scores, widths[0] + widths[1]);
         for (unsigned int left = O::F::to_mask(scores.counts) & ((1u << some) - 1); left != 0; left &= left - 1) {

@@ -11,10 +11,12 @@ struct NearestCorners {
     typedef F::bits bits;
     typedef F::Point Point;
     // The corners of up to 16 pairs of faces in A's frame, scaled; the first pair in the place of those that lack.
-    static N::Corners load(const void* near, const void* ids, int start_a, int start_b, const wp::float32 (&r)[3][3],
-                           const wp::vec3& there, float scale, const wp::int64* items, int count) {
+    template <class Trees, class PairPose>
+    static N::Corners load(const Trees& trees, const PairPose& pose, const wp::vec3& there, float scale,
+                           const wp::int64* items, int count) {
+        const auto& r = pose.rotation32.data;
         N::Corners c;
-        FaceItems(items, count).gather(near, ids, start_a, start_b, c.a, c.b);
+        FaceItems(items, count).gather(trees, pose, c.a, c.b);
         for (int k = 0; k < 3; ++k) {
             const Point p = c.a[k], q = c.b[k];
             c.a[k] = Point{p.x * scale, p.y * scale, p.z * scale};

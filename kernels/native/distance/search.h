@@ -23,16 +23,13 @@ struct NearestLimits {
 };
 
 // Measure up to 16 pairs of faces in float32: those that may be nearest wait for float64.
-template <class ModelPool, class StatePool, class PairPose, class SearchScale>
-void measure_faces(const ModelPool& models, const StatePool& states, const PairPose& pose, const SearchScale& scaling,
-                   const wp::vec4& terms, const NearestMemory& m, const wp::int64* items, int count,
-                   NearestLimits& limits) {
+template <class Trees, class PairPose, class SearchScale>
+void measure_faces(const Trees& trees, const PairPose& pose, const SearchScale& scaling, const wp::vec4& terms,
+                   const NearestMemory& m, const wp::int64* items, int count, NearestLimits& limits) {
     typedef NearestFaces N;
     typedef N::F F;
     NearestMemory::Header& h = *m.header;
-    const N::Corners corners =
-        NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a, pose.corner_b,
-                             pose.rotation32.data, scaling.translation, scaling.scale, items, count);
+    const N::Corners corners = NearestCorners::load(trees, pose, scaling.translation, scaling.scale, items, count);
     F::lanes size;
     const F::lanes d = __builtin_elementwise_sqrt(N::measure(corners, size));
     const F::lanes error = N::error_of(d, size, scaling.error), over = d + error, under = d - error;
@@ -53,18 +50,18 @@ void measure_faces(const ModelPool& models, const StatePool& states, const PairP
     h.face_tests += count;
 }
 
-template <class ModelPool, class StatePool, class PairPose, class SearchScale, class Slabs, class PairTests>
-bool search_nearest(const ModelPool& models, const StatePool& states, const PairPose& pose, const SearchScale& scaling,
-                    wp::vec4 terms, const Slabs& slabs, bool with_slabs, wp::int32 thread,
-                    wp::array_t<wp::float32> memory, PairTests& tests) {
+template <class Trees, class PairPose, class SearchScale, class Slabs, class PairTests>
+bool search_nearest(const Trees& trees, const PairPose& pose, const SearchScale& scaling, wp::vec4 terms,
+                    const Slabs& slabs, bool with_slabs, wp::int32 thread, wp::array_t<wp::float32> memory,
+                    PairTests& tests) {
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
     const auto& r = pose.rotation32.data;
     NearBoxes boxes = NearBoxes::make(r, scaling.back, scaling.translation, scaling.margin, scaling.scale,
-                                      states.node_box.data, pose.node_a, pose.node_b);
+                                      trees.states.node_box.data, pose.node_a, pose.node_b);
     boxes.margin = SLAB_MARGINS * scaling.margin;
     if (with_slabs) {
-        boxes.slabs = (const char*)slabs.record.data - (const char*)states.node_box.data;
+        boxes.slabs = (const char*)slabs.record.data - (const char*)trees.states.node_box.data;
         boxes.normals = h.face_tests >= NORMALS_LEAST;
     }
     // Apart from the memory that lists are written to.
@@ -113,7 +110,7 @@ bool search_nearest(const ModelPool& models, const StatePool& states, const Pair
         if (waiting > 0) {
             const int count = waiting < 16 ? waiting : 16;
             waiting -= count;
-            measure_faces(models, states, pose, scaling, terms, m, m.face + waiting, count, limits);
+            measure_faces(trees, pose, scaling, terms, m, m.face + waiting, count, limits);
             boxes.normals = h.face_tests >= NORMALS_LEAST;
             if (h.open_count > OPEN_LENGTH - 16)
                 m.keep_open();

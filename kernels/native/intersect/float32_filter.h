@@ -2,6 +2,7 @@
 // more, it also lists those that are apart, but not by more than the gap along the normal of a plane.
 #pragma once
 #include "builtin.h"
+#include "intersect/sides.h"
 #include "triangle/face_items.h"
 #include "triangle/float32_filter.cuh"
 
@@ -24,58 +25,51 @@ inline void pose_corners(const PairPose& pose, Float32::Point (&a)[3], Float32::
     }
 }
 
-// Of the signs of three corners over a plane those that are 1 and those that are -1, a bit each; where they lie on one
-// side, where they lie there farther than a gap, and where one is UNCERTAIN or all are 0.
+// Of three corners over a plane their sides; where they lie on one side, where they lie there farther than a gap, and
+// where one is UNCERTAIN or all are 0.
 struct FilterSides {
     typedef Float32 F;
-    unsigned int above[3], below[3], one_sided, far, uncertain;
+    Sides sides[3];
+    unsigned int one_sided, far, uncertain;
 
     static FilterSides make(const PlaneFilter::Heights& x) {
         FilterSides s;
-        unsigned int none[3];
+        unsigned int any_open = 0, all_open = ~0u;
         for (int i = 0; i < 3; ++i) {
-            s.above[i] = F::to_mask(x.value[i] > x.bound);
-            s.below[i] = F::to_mask(x.value[i] < -x.bound);
-            none[i] = ~(s.above[i] | s.below[i]);
+            const unsigned int above = F::to_mask(x.value[i] > x.bound), below = F::to_mask(x.value[i] < -x.bound);
+            s.sides[i] = Sides{above, below, ~(above | below)};
+            any_open |= s.sides[i].open;
+            all_open &= s.sides[i].open;
         }
-        s.one_sided = (s.above[0] & s.above[1] & s.above[2]) | (s.below[0] & s.below[1] & s.below[2]);
-        s.far = s.one_sided;
-        s.uncertain = (none[0] | none[1] | none[2]) & (~F::to_mask(x.bound == 0.0f) | (none[0] & none[1] & none[2]));
+        s.far = s.one_sided = Sides::one_sided(s.sides);
+        s.uncertain = any_open & (~F::to_mask(x.bound == 0.0f) | all_open);
         return s;
     }
     void find_far(const PlaneFilter::Heights& x, const F::lanes& wide) {
         far = F::to_mask((x.value[0] > wide) & (x.value[1] > wide) & (x.value[2] > wide)) |
               F::to_mask((x.value[0] < -wide) & (x.value[1] < -wide) & (x.value[2] < -wide));
     }
-    // As `find_alone`, and the corners rotated so that this one comes first.
+    // The corners rotated so that the lone one comes first.
     void rotate(const F::Point (&c)[3], F::bits& back, F::Point& p, F::Point& q, F::Point& last) const {
-        const unsigned int pair_above = above[0] & above[1], odd_above = above[0] ^ above[1];
-        const unsigned int pair_below = below[0] & below[1], odd_below = below[0] ^ below[1];
-        const unsigned int positive = (odd_above ^ above[2]) & ~(pair_above & above[2]);
-        const unsigned int negative = (odd_below ^ below[2]) & ~(pair_below & below[2]) & ~positive;
-        const unsigned int zero = ~(positive | negative);
-        auto is_kind = [&](int i) {
-            return F::widen((positive & above[i]) | (negative & below[i]) | (zero & ~(above[i] | below[i])));
-        };
-        const F::bits first = is_kind(0), second = is_kind(1);
-        back = F::widen(negative | (zero & (pair_above | (odd_above & above[2]))));
+        const Alone alone = Sides::find_alone(sides);
+        const F::bits first = F::widen(alone.first), second = F::widen(alone.second);
+        back = F::widen(alone.back);
         p = F::choose(first, c[0], F::choose(second, c[1], c[2]));
         q = F::choose(first, c[1], F::choose(second, c[2], c[0]));
         last = F::choose(first, c[2], F::choose(second, c[0], c[1]));
     }
 };
 
-template <class ModelPool, class StatePool, class PairPose, class Filtered>
-void simd_float32_filter(const ModelPool& models, const StatePool& states, const PairPose& pose, wp::vec3 bounds,
-                         bool first_ends, wp::int32 waiting, wp::array_t<wp::int64> faces,
-                         wp::array_t<wp::int64> uncertain, wp::array_t<wp::int64> apart, Filtered& found) {
+template <class Trees, class PairPose, class FaceLists>
+void simd_float32_filter(const Trees& trees, const PairPose& pose, wp::vec3 bounds, bool first_ends, FaceLists& lists) {
 #pragma clang fp contract(off)
     typedef Float32 F;
     typedef F::bits bits;
     typedef F::Point Point;
     const float error = bounds[0], gap = bounds[2];
     const PlaneFilter filter = {error, bounds[1]};
-    wp::int64 *list = faces.data, *rest = uncertain.data, *beside = apart.data;
+    wp::int64 *list = lists.faces.data, *rest = lists.uncertain_faces.data, *beside = lists.apart_faces.data;
+    const int waiting = lists.waiting;
     int met = 0, open = 0, done = 0, near_count = 0;
     if (error == __builtin_inff()) {
         for (; open < waiting; ++open)
@@ -87,7 +81,7 @@ void simd_float32_filter(const ModelPool& models, const StatePool& states, const
         const FaceItems items(list + done, count);
         done += count;
         Point a[3], b[3];
-        items.gather(models.vertex_near.data, states.face_corner.data, pose.corner_a, pose.corner_b, a, b);
+        items.gather(trees, pose, a, b);
         pose_corners(pose, a, b);
         PlaneFilter::Heights of_a, of_b;
         filter.compare_planes(a, b, of_a, of_b);
@@ -130,8 +124,8 @@ void simd_float32_filter(const ModelPool& models, const StatePool& states, const
         // Last: those that meet take the place of pairs that were tested, perhaps of these.
         met += items.append(list + met, meet);
     }
-    found.met = met;
-    found.uncertain = open;
-    found.apart = near_count;
-    found.tested = done;
+    lists.met = met;
+    lists.uncertain = open;
+    lists.apart = near_count;
+    lists.tested = done;
 }

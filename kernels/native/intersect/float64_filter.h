@@ -5,6 +5,7 @@
 #include "base/sizes.h"
 #include "base/float64.h"
 #include "intersect/filter_lists.h"
+#include "intersect/sides.h"
 
 // What the filter reads of an object pair, and its steps.
 template <class PairPose>
@@ -15,24 +16,14 @@ struct Float64Filter {
     typedef F::ints ints;
     typedef F::Point Point;
     typedef F::Sign Sign;
-    typedef F::Sides Sides;
     typedef int four_ints __attribute__((vector_size(16)));
     typedef unsigned int counts __attribute__((vector_size(32)));
     typedef int ids[STRADDLING_ROOM];
     const PairPose& pose;
     const double *position, *corners;
 
-    // As `pose_point`.
     __attribute__((always_inline)) Point gather_posed(const int* start) const {
-        const Point p = F::gather(position, start);
-        const auto& r = pose.rotation.data;
-        const auto& t = pose.translation;
-        lanes x[3];
-        for (int i = 0; i < 3; ++i) {
-            const lanes y = ((r[i][0] * p.x + r[i][1] * p.y) + r[i][2] * p.z) + t[i];
-            x[i] = F::absolute(y) < COORDINATE_MIN ? lanes{} : y;
-        }
-        return Point{x[0], x[1], x[2]};
+        return F::pose(pose.rotation.data, pose.translation, F::gather(position, start));
     }
     // Where the corners' numbers start, of A and of B, of so many pairs of faces.
     __attribute__((always_inline)) void find_corners(const wp::int64* items, int count, ids (&start)[6]) const {
@@ -60,6 +51,21 @@ struct Float64Filter {
             }
         }
     }
+    // The corners at a place of three lists, rotated so that the lone one comes first, in either direction.
+    static void rotate(const Alone& alone, unsigned int back, const int* a, const int* b, const int* c, ints* rotated) {
+        const ints corner[3] = {F::look_up(a), F::look_up(b), F::look_up(c)};
+        const ints first = F::widen(alone.first), second = F::widen(alone.second), turns_back = F::widen(back);
+        rotated[0] = first ? corner[0] : second ? corner[1] : corner[2];
+        const ints q = first ? corner[1] : second ? corner[2] : corner[0];
+        const ints r = first ? corner[2] : second ? corner[0] : corner[1];
+        rotated[1] = turns_back ? r : q;
+        rotated[2] = turns_back ? q : r;
+    }
+    static Sides filtered(const Sign& sign) {
+        const lanes bound = BOUND_3D * sign.size;
+        const unsigned int above = F::to_mask(sign.value > bound), below = F::to_mask(sign.value < -bound);
+        return Sides{above, below, 255 & ~(above | below | F::to_mask(bound == 0.0))};
+    }
     // Up to 8 straddling pairs from one on, which two more signs decide.
     __attribute__((always_inline)) void order_ends(const ids (&rotated)[6], const wp::int64* straddling, int first,
                                                    int count, FilterLists& lists) const {
@@ -71,8 +77,8 @@ struct Float64Filter {
         const Sign start =
             F::orient_edges(p1p2, F::minus(p1, q2), F::minus(q1, p2), F::minus(q1, q2), F::minus(p2, q2));
         const Sign end = F::orient_edges(F::minus(p1, r2), p1p2, F::minus(r1, r2), F::minus(r1, p2), F::minus(r2, p2));
-        const Sides s = F::filtered(start.value, BOUND_3D * start.size);
-        const Sides e = F::filtered(end.value, BOUND_3D * end.size);
+        const Sides s = filtered(start);
+        const Sides e = filtered(end);
         const unsigned int all = (1u << count) - 1, left = all & ~(s.above | e.above);
         unsigned int inexact = left & (s.open | e.open);
         lists.keep_apart(item, all & ~left);
@@ -99,7 +105,7 @@ struct Float64Filter {
             side_a[i].open = ~(side_a[i].above | side_a[i].below | F::to_mask(bound[i] == 0.0));
             side_b[i].open = ~(side_b[i].above | side_b[i].below | F::to_mask(bound[i + 3] == 0.0));
         }
-        unsigned int undecided = F::has_all_zero(side_a) | F::has_all_zero(side_b);
+        unsigned int undecided = Sides::has_all_zero(side_a) | Sides::has_all_zero(side_b);
         for (int i = 0; i < 3; ++i)
             undecided |= side_a[i].open | side_b[i].open;
         undecided &= left;
@@ -112,10 +118,9 @@ struct Float64Filter {
     }
 };
 
-template <class ModelPool, class StatePool, class PairPose, class Filtered>
-void simd_float64_filter(const ModelPool& models, const StatePool& states, const PairPose& pose, bool first_ends,
-                         bool lists_apart, Filtered& found, wp::array_t<wp::int64> uncertain,
-                         wp::array_t<wp::int64> faces, wp::array_t<wp::int64> apart) {
+template <class Trees, class PairPose, class FaceLists>
+void simd_float64_filter(const Trees& trees, const PairPose& pose, bool first_ends, bool lists_apart,
+                         FaceLists& lists) {
 #pragma clang fp contract(off)
     typedef Float64 F;
     typedef Float64Filter<PairPose> Filter;
@@ -124,11 +129,10 @@ void simd_float64_filter(const ModelPool& models, const StatePool& states, const
     typedef F::ints ints;
     typedef F::Point Point;
     typedef F::Sign Sign;
-    typedef F::Sides Sides;
-    const double* position = (const double*)models.vertex_pos.data;
-    const Filter filter = {pose, position, (const double*)states.face_corner.data};
-    const wp::int64* items = uncertain.data;
-    FilterLists lists = {faces.data, uncertain.data, lists_apart ? apart.data : nullptr, found.met, 0, found.apart};
+    const double* position = (const double*)trees.models.vertex_pos.data;
+    const Filter filter = {pose, position, (const double*)trees.states.face_corner.data};
+    wp::int64 *items = lists.uncertain_faces.data, *beside = lists_apart ? lists.apart_faces.data : nullptr;
+    FilterLists decided = {lists.faces.data, items, beside, lists.met, 0, lists.apart};
     int kept = 0;
     // Straddling pairs, which two more signs decide, and their corners, rotated: p, q, r of A and of B.
     typename Filter::ids rotated[6], start[6];
@@ -138,12 +142,12 @@ void simd_float64_filter(const ModelPool& models, const StatePool& states, const
         for (int i = 0; i < 6; ++i)
             *(F::loose_ints*)(rotated[i] + kept) = ints{};
         for (int i = 0; i < kept; i += 8)
-            filter.order_ends(rotated, straddling, i, kept - i < 8 ? kept - i : 8, lists);
+            filter.order_ends(rotated, straddling, i, kept - i < 8 ? kept - i : 8, decided);
         kept = 0;
     };
-    const int waiting = found.uncertain, before = found.met, at_once = first_ends ? 8 : STRADDLING_ROOM;
+    const int waiting = lists.uncertain, before = lists.met, at_once = first_ends ? 8 : STRADDLING_ROOM;
     int done = 0;
-    while (done < waiting && (lists.met == before || !first_ends)) {
+    while (done < waiting && (decided.met == before || !first_ends)) {
         const int count = waiting - done < 8 ? waiting - done : 8;
         const int at = done % at_once;
         if (at == 0)
@@ -163,23 +167,24 @@ void simd_float64_filter(const ModelPool& models, const StatePool& states, const
             side_a[i] = Sides{F::to_mask(of_a.value > bound[i]), F::to_mask(of_a.value < -bound[i]), 0};
             side_b[i] = Sides{F::to_mask(of_b.value < -bound[i + 3]), F::to_mask(of_b.value > bound[i + 3]), 0};
         }
-        const unsigned int all = (1u << count) - 1, parted = all & (F::one_sided(side_a) | F::one_sided(side_b));
-        lists.keep_apart(item, parted);
+        const unsigned int all = (1u << count) - 1,
+                           parted = all & (Sides::one_sided(side_a) | Sides::one_sided(side_b));
+        decided.keep_apart(item, parted);
         unsigned int left = all & ~parted;
-        F::Alone alone_a = F::find_lone(side_a), alone_b = F::find_lone(side_b);
+        Alone alone_a = Sides::find_lone(side_a), alone_b = Sides::find_lone(side_b);
         // Else no sign that counts is open or 0.
-        if (__builtin_expect((left & ~(F::has_sides(side_a) & F::has_sides(side_b))) != 0, 0)) {
+        if (__builtin_expect((left & ~(Sides::has_sides(side_a) & Sides::has_sides(side_b))) != 0, 0)) {
             unsigned int shared;
             const unsigned int undecided = Filter::find_undecided(left, bound, d_size, side_a, side_b, shared);
             left &= ~undecided;
-            lists.keep_hits(item, shared);
-            lists.keep_open(item, undecided & ~shared);
-            alone_a = F::find_alone(side_a);
-            alone_b = F::find_alone(side_b);
+            decided.keep_hits(item, shared);
+            decided.keep_open(item, undecided & ~shared);
+            alone_a = Sides::find_alone(side_a);
+            alone_b = Sides::find_alone(side_b);
         }
         ints order[6];
-        F::rotate(alone_a, alone_b.back, start[0] + at, start[1] + at, start[2] + at, order);
-        F::rotate(alone_b, alone_a.back, start[3] + at, start[4] + at, start[5] + at, order + 3);
+        Filter::rotate(alone_a, alone_b.back, start[0] + at, start[1] + at, start[2] + at, order);
+        Filter::rotate(alone_b, alone_a.back, start[3] + at, start[4] + at, start[5] + at, order + 3);
         for (int i = 0; i < 6; ++i)
             F::append_ints(rotated[i] + kept, order[i], left);
         F::append(straddling + kept, item, left);
@@ -188,8 +193,8 @@ void simd_float64_filter(const ModelPool& models, const StatePool& states, const
         if (last || kept > STRADDLING_ROOM - 16)
             order_kept();
     }
-    found.met = lists.met;
-    found.uncertain = lists.open;
-    found.apart = lists.apart;
-    found.tested = done;
+    lists.met = decided.met;
+    lists.uncertain = decided.open;
+    lists.apart = decided.apart;
+    lists.tested = done;
 }

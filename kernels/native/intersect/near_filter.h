@@ -3,9 +3,8 @@
 #include "builtin.h"
 #include "distance/corners32.h"
 
-template <class ModelPool, class StatePool, class PairPose>
-wp::int32 simd_near_filter(const ModelPool& models, const StatePool& states, const PairPose& pose, wp::int32 waiting,
-                           wp::array_t<wp::int64> faces) {
+template <class Trees, class PairPose>
+wp::int32 simd_near_filter(const Trees& trees, const PairPose& pose, wp::int32 waiting, wp::array_t<wp::int64> faces) {
     typedef NearestFaces N;
     typedef N::F F;
     wp::int64* list = faces.data;
@@ -19,9 +18,7 @@ wp::int32 simd_near_filter(const ModelPool& models, const StatePool& states, con
     int kept = 0;
     for (int done = 0; done < waiting; done += 16) {
         const int count = waiting - done < 16 ? waiting - done : 16;
-        const N::Corners corners =
-            NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a, pose.corner_b,
-                                 pose.rotation32.data, there, scale, list + done, count);
+        const N::Corners corners = NearestCorners::load(trees, pose, there, scale, list + done, count);
         F::lanes size;
         const F::lanes d = __builtin_elementwise_sqrt(N::measure(corners, size));
         // Differences of corners err by `error` along an axis.

@@ -1,6 +1,7 @@
 // Leaves of two small trees in a warp's shared memory, where its stack lies otherwise. On the CPU a warp is one thread.
 #pragma once
 #include "builtin.h"
+#include "base/lanes.cuh"
 #include "base/shared.cuh"
 #include "base/sizes.h"
 
@@ -34,25 +35,9 @@ inline CUDA_CALLABLE wp::int32 read_half(wp::uint64 items, wp::int32 i) {
 }
 
 inline CUDA_CALLABLE void push_half(wp::uint64 items, wp::int32 end, bool flag, wp::int32 x) {
-#if defined(__CUDA_ARCH__)
-    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    end += __popc(votes & ((1u << threadIdx.x) - 1u));
-#endif
+    const int at = next_place(end, flag);
     if (flag)
-        *entry<volatile unsigned short>(items, end) = (unsigned short)x;
-}
-
-inline CUDA_CALLABLE wp::int32 reserve_run(wp::array_t<wp::int32> total, wp::int32 count) {
-#if defined(__CUDA_ARCH__)
-    int start = 0;
-    if (threadIdx.x == 0)
-        start = atomicAdd(total.data, count);
-    return __shfl_sync(0xffffffffu, start, 0);
-#else
-    const int start = total.data[0];
-    total.data[0] = start + count;
-    return start;
-#endif
+        *entry<volatile unsigned short>(items, at) = (unsigned short)x;
 }
 
 inline CUDA_CALLABLE wp::uint32 compare_boxes(wp::uint64 items, wp::int32 rows, wp::vec3 lower, wp::vec3 upper,

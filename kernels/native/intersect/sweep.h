@@ -24,13 +24,7 @@ struct SweptRows {
             }
             return from;
         }
-        for (int shift = 32; shift < 64; shift += 8) {
-            sort_digit(from, to, count, shift);
-            word* const last = from;
-            from = to;
-            to = last;
-        }
-        return from;
+        return sort_words(from, to, count, 32);
     }
 };
 

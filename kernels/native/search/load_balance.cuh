@@ -1,6 +1,7 @@
 // The queue of dynamic load balancing between warps: counters, and slots that idle warps wait at.
 #pragma once
 #include "builtin.h"
+#include "base/counters.cuh"
 #include "base/sizes.h"
 
 inline CUDA_CALLABLE wp::int32 first_ended(bool descends, wp::array_t<wp::int32> counter) {
@@ -14,25 +15,6 @@ inline CUDA_CALLABLE wp::int32 first_unit(wp::array_t<wp::int32> counter) {
     return __shfl_sync(0xffffffffu, taken >= NO_UNIT ? NO_UNIT : (int)blockIdx.x, 0);
 #else
     return counter.data[3] >= NO_UNIT ? NO_UNIT : 0;
-#endif
-}
-
-inline CUDA_CALLABLE wp::int32 take_unit(wp::array_t<wp::int32> counter) {
-#if defined(__CUDA_ARCH__)
-    int unit = 0;
-    if (threadIdx.x == 0)
-        unit = atomicAdd(counter.data + 3, 1);
-    return __shfl_sync(0xffffffffu, unit, 0);
-#else
-    return __atomic_fetch_add(counter.data + 3, 1, __ATOMIC_RELAXED);
-#endif
-}
-
-inline CUDA_CALLABLE wp::int32 claim_unit(wp::array_t<wp::int32> counter) {
-#if defined(__CUDA_ARCH__)
-    return threadIdx.x == 0 ? atomicAdd(counter.data + 3, 1) : 0;
-#else
-    return __atomic_fetch_add(counter.data + 3, 1, __ATOMIC_RELAXED);
 #endif
 }
 
@@ -54,13 +36,8 @@ inline CUDA_CALLABLE wp::int64 load_tickets(wp::array_t<wp::int32> counter) {
 }
 
 inline CUDA_CALLABLE wp::int32 count_idle(wp::int64 tickets) {
-    const int idle = (int)(tickets >> 32) - (int)tickets;
-#if defined(__CUDA_ARCH__)
     // Lanes that were not together read at different times; what follows needs the same number in all.
-    return __shfl_sync(0xffffffffu, idle, 0);
-#else
-    return idle;
-#endif
+    return hold_uniform((int)(tickets >> 32) - (int)tickets);
 }
 
 inline CUDA_CALLABLE wp::int32 await_donation(wp::array_t<wp::int32> counter, wp::array_t<wp::int32> flag,

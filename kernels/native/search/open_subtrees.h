@@ -80,8 +80,10 @@ struct SlabAxes {
     }
 };
 
-template <class ModelPool, class StatePool, class PairPose>
-wp::int64 slab_cost(const ModelPool& models, const StatePool& states, const PairPose& pose, wp::int32 repeats) {
+template <class Trees, class PairPose>
+wp::int64 slab_cost(const Trees& trees, const PairPose& pose, wp::int32 repeats) {
+    const auto& models = trees.models;
+    const auto& states = trees.states;
     wp::int64 cost = 0;
     // About how many faces an object has at its LOD: each vertex split adds as many as any other.
     auto faces_of = [&](int place) {
@@ -96,15 +98,15 @@ wp::int64 slab_cost(const ModelPool& models, const StatePool& states, const Pair
     return cost;
 }
 
-template <class ModelPool, class StatePool, class PairPose, class Descent>
-void open_subtrees(const ModelPool& models, const StatePool& states, const PairPose& pose, Descent& descent,
-                   wp::array_t<wp::float32> memory) {
+template <class Trees, class PairPose, class Descent>
+void open_subtrees(const Trees& trees, const PairPose& pose, Descent& descent, wp::array_t<wp::float32> memory) {
+    const auto& states = trees.states;
     const Slabs::Memory kept = Slabs::find_memory(memory.data, memory.shape[1], descent.thread);
     const Slabs::Box* nodes = (const Slabs::Box*)states.node_box.data;
     const Slabs::Content a = Slabs::content_of(states.node_start.data, states.model.data, states.lod.data, pose.node_a);
     if (!(*kept.whose == a)) {
-        SlabAxes::choose_axes(nodes + pose.node_a, states.face_corner.data + pose.corner_a, models.vertex_near.data,
-                              kept.axes);
+        SlabAxes::choose_axes(nodes + pose.node_a, states.face_corner.data + pose.corner_a,
+                              trees.models.vertex_near.data, kept.axes);
         *kept.whose = a;
         for (int i = 0; i < kept.slots; ++i)
             kept.roots[i] = 0;

@@ -5,16 +5,15 @@
 #include "search/slabs.h"
 #include "search/siblings.h"
 
-template <class ModelPool, class StatePool, class PairPose, class Descent>
-wp::int32 descend_subtrees(const ModelPool& models, const StatePool& states, const PairPose& pose, Descent& descent,
-                           wp::array_t<wp::int64> below, wp::array_t<wp::float32> memory,
-                           wp::array_t<wp::int64> faces) {
+template <class Trees, class PairPose, class Descent>
+wp::int32 descend_subtrees(const Trees& trees, const PairPose& pose, Descent& descent, wp::array_t<wp::int64> below,
+                           wp::array_t<wp::float32> memory, wp::array_t<wp::int64> faces) {
     typedef Slabs::lanes lanes;
     typedef Slabs::Record Record;
     typedef bool flags __attribute__((ext_vector_type(32)));
     const Slabs::Memory kept = Slabs::find_memory(memory.data, memory.shape[1], descent.thread);
-    const Slabs::Box* nodes = (const Slabs::Box*)states.node_box.data;
-    const int* corners = (const int*)states.face_corner.data;
+    const Slabs::Box* nodes = (const Slabs::Box*)trees.states.node_box.data;
+    const int* corners = (const int*)trees.states.face_corner.data;
     const lanes *of_a = (const lanes*)kept.of_a, *of_b = (const lanes*)kept.of_b;
     const wp::int64 records_b = (wp::int64)SUBTREE_RECORDS * kept.slots;
     const Slabs::Side sides[2] = {{nodes + pose.node_a,
@@ -33,7 +32,7 @@ wp::int32 descend_subtrees(const ModelPool& models, const StatePool& states, con
                                    kept.floors[1],
                                    kept.roots + kept.slots,
                                    kept.records + records_b}};
-    const void* near = models.vertex_near.data;
+    const void* near = trees.models.vertex_near.data;
     PairLists lists = {below.data, faces.data, descent.deep, 0};
     const int ready = descent.ready;
     wp::int64 compared = 0;

@@ -57,15 +57,9 @@ inline CUDA_CALLABLE wp::uint64 signed_pairs() {
 
 inline CUDA_CALLABLE void push_signed_pair(wp::uint64 list, wp::int32& end, bool flag, wp::vec_t<3, wp::int32> item,
                                            wp::int32 signs) {
-#if defined(__CUDA_ARCH__)
-    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    const int at = end + __popc(votes & ((1u << (threadIdx.x & 31)) - 1u)), more = __popc(votes);
-#else
-    const int at = end, more = flag;
-#endif
+    const int at = next_place(end, flag);
     if (flag)
         *entry<SignedPair>(list, at) = SignedPair{item[0], item[1], item[2], signs};
-    end += more;
 }
 
 inline CUDA_CALLABLE wp::int32 read_signed_pair(wp::uint64 list, wp::int32 i, wp::vec_t<3, wp::int32>& item) {

@@ -33,25 +33,26 @@ struct FaceItems {
 #endif
         return count;
     }
-    // Corners, each in the frame of its own model, of which A's faces start at a place, and B's.
-    __attribute__((always_inline)) void gather(const void* near, const void* corners, int start_a, int start_b,
-                                               Point (&a)[3], Point (&b)[3]) const {
+    // Corners, each in the frame of its own model.
+    template <class Trees, class PairPose>
+    __attribute__((always_inline)) void gather(const Trees& trees, const PairPose& pose, Point (&a)[3],
+                                               Point (&b)[3]) const {
         const bits first = (bits)low, second = (bits)high;
         // Rows of two faces, then of six corners: the high halves of the items, and the low ones.
         alignas(64) F::sixteen face[2], corner[6];
-        *(counts*)face[0] = 2 * (counts)(start_a + __builtin_shufflevector(first, second, 1, 3, 5, 7, 9, 11, 13, 15, 17,
-                                                                           19, 21, 23, 25, 27, 29, 31));
-        *(counts*)face[1] = 2 * (counts)(start_b + __builtin_shufflevector(first, second, 0, 2, 4, 6, 8, 10, 12, 14, 16,
-                                                                           18, 20, 22, 24, 26, 28, 30));
+        *(counts*)face[0] = 2 * (counts)(pose.corner_a + __builtin_shufflevector(first, second, 1, 3, 5, 7, 9, 11, 13,
+                                                                                 15, 17, 19, 21, 23, 25, 27, 29, 31));
+        *(counts*)face[1] = 2 * (counts)(pose.corner_b + __builtin_shufflevector(first, second, 0, 2, 4, 6, 8, 10, 12,
+                                                                                 14, 16, 18, 20, 22, 24, 26, 28, 30));
         for (int i = 0; i < 2; ++i) {
-            const Point c = F::gather(corners, face[i]);
+            const Point c = F::gather(trees.states.face_corner.data, face[i]);
             *(counts*)corner[3 * i] = 2 * (counts)c.x;
             *(counts*)corner[3 * i + 1] = 2 * (counts)c.y;
             *(counts*)corner[3 * i + 2] = 2 * (counts)c.z;
         }
         for (int k = 0; k < 3; ++k) {
-            a[k] = F::gather(near, corner[k]);
-            b[k] = F::gather(near, corner[3 + k]);
+            a[k] = F::gather(trees.models.vertex_near.data, corner[k]);
+            b[k] = F::gather(trees.models.vertex_near.data, corner[3 + k]);
         }
     }
 };

@@ -8,6 +8,7 @@ import warp as wp
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.distance.within import PROVED_APART, Question
 from warp_abtree.kernels.intersect import face_pairs, near_faces
+from warp_abtree.kernels.search import item
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.request import APART_FOR_UNCERTAIN, OUTPUTS, PRECISIONS, check_gap, check_request
 from warp_abtree.query.result import COUNTERS, Found
@@ -71,7 +72,7 @@ class IntersectStage(HitStage):
         super().attach(operator)
         if self._with_gap:
             self.hits.apart_total = wp.zeros(1, dtype=wp.int32, device=operator.device)
-        self.traversal = Traversal(self.operator, self._asked.output == int(face_pairs.OUTPUT_ANY))
+        self.traversal = Traversal(self.operator, self._asked.output == int(item.OUTPUT_ANY))
         self._no_distance = wp.empty(0, dtype=wp.float64, device=operator.device)
         operator.hits, operator.traversal, operator.lists_hits = self.hits, self.traversal, self._reads
         operator.lists_apart = self._slots is not None

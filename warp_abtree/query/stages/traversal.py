@@ -19,7 +19,7 @@ from warp_abtree.kernels.intersect import (
     simd,
     uncertain_pairs,
 )
-from warp_abtree.kernels.search import descent, load_balance, thread_search
+from warp_abtree.kernels.search import descent, item, load_balance, thread_search
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH
 from warp_abtree.query.operator import Operator
 from warp_abtree.query.stage import Array, Rooms
@@ -35,7 +35,7 @@ class AskedHits(NamedTuple):
     """Traversal for face pairs that intersect, or are nearer than a gap.
 
     Attributes:
-        mode, output: As for the kernels, `face_pairs` has them.
+        mode, output: As for the kernels, `face_pairs` and `item` have them.
         reduced: Whether what is apart is reduced to slots: threads offer it to them, warps list it.
     """
 
@@ -46,15 +46,17 @@ class AskedHits(NamedTuple):
     def kernel(self, warps: bool):
         """Return the kernel that traverses."""
         if warps:
-            return dual_tree.warp_traversal(self.mode, self.output == int(face_pairs.OUTPUT_ANY))
+            return dual_tree.warp_traversal(self.mode, self.output == int(item.OUTPUT_ANY))
         return near_search.thread_near_search() if self.reduced else simd.thread_traversal(self.mode)
 
     def found(self, warps: bool, hits, slots):
         """Return what it writes."""
         if warps or not self.reduced:
-            return hits
-        found = near_search.NearFound()
-        found.hits, found.slots = hits, slots
+            found = face_pairs.FoundHits()
+        else:
+            found = near_search.NearFound()
+            found.slots = slots
+        found.hits = hits
         return found
 
     def has_distances(self) -> bool:
