@@ -61,6 +61,16 @@ def map_point(rotation: wp.mat33, translation: wp.vec3, p: wp.vec3):
     return x
 
 
+@wp.func
+def reach_there(rotation: wp.mat33, size: wp.vec3, margin: wp.float32):
+    """Return the width of a box's image in the other frame, widened by a margin on either side."""
+    reach = wp.vec3()
+    for i in range(3):
+        x = fuse32(wp.abs(rotation[i, 2]), size[2], margin + margin)
+        reach[i] = fuse32(wp.abs(rotation[i, 0]), size[0], fuse32(wp.abs(rotation[i, 1]), size[1], x))
+    return reach
+
+
 @wp.struct
 class PosedBox:
     """A box along the axes of its own frame, and its image along those of the other frame."""
@@ -81,10 +91,7 @@ def pose_box(lower: wp.vec3, upper: wp.vec3, rotation: wp.mat33, translation: wp
     box.sum = upper + lower
     box.size = upper - lower
     box.posed_sum = map_point(rotation, translation + translation, box.sum)
-    for i in range(3):
-        reach = fuse32(wp.abs(rotation[i, 2]), box.size[2], margin + margin)
-        reach = fuse32(wp.abs(rotation[i, 1]), box.size[1], reach)
-        box.posed_size[i] = fuse32(wp.abs(rotation[i, 0]), box.size[0], reach)
+    box.posed_size = reach_there(rotation, box.size, margin)
     return box
 
 

@@ -7,7 +7,7 @@ nearest are what they meet with. So the gap of such an object pair is cut to its
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import Trees
-from warp_abtree.kernels.base.poses import PairBatch
+from warp_abtree.kernels.base.poses import PairBatch, active_faces
 from warp_abtree.kernels.bodies.bodies import DYNAMIC, Bodies
 from warp_abtree.kernels.distance.report import Distances
 
@@ -31,9 +31,7 @@ class Chosen:
 @wp.func
 def half_face_size(trees: Trees, state: wp.int32, radius: wp.float64):
     """Estimate half the width of a body's faces at its LOD, as if it were a ball [world units]."""
-    model = trees.states.model[state]
-    faces = trees.models.face_count[model] - 2 * (trees.models.lod_max[model] - trees.states.lod[state])
-    return HALF_ROOT * radius / wp.sqrt(wp.float64(wp.max(faces, FACES_LEAST)))
+    return HALF_ROOT * radius / wp.sqrt(wp.float64(wp.max(active_faces(trees, state), FACES_LEAST)))
 
 
 @wp.func

@@ -27,7 +27,7 @@ from warp_abtree.kernels.base.lanes import (
 )
 from warp_abtree.kernels.base.poses import HALF, PairBatch
 from warp_abtree.kernels.base.sums import add_nine_in_order, nine_numbers
-from warp_abtree.kernels.bodies.bodies import DYNAMIC, ZERO, Bodies
+from warp_abtree.kernels.bodies.bodies import DYNAMIC, ONE, ZERO, Bodies
 from warp_abtree.kernels.bodies.constraints import Constraints
 from warp_abtree.kernels.bodies.relaxed_points import (
     Relaxation,
@@ -226,12 +226,11 @@ def apply_impulses(
             constraints.friction_impulse[p, k] = across
         total = add_nine_in_order(total, own, wp.min(count - first, warp_size()))
     if warp_lane() == 0:
-        if bodies.motion_type[pair[0]] == DYNAMIC:
-            bodies.velocity[pair[0]] = bodies.velocity[pair[0]] - bodies.inverse_mass[pair[0]] * third_of(total, 0)
-            bodies.momentum[pair[0]] = bodies.momentum[pair[0]] - third_of(total, 1)
-        if bodies.motion_type[pair[1]] == DYNAMIC:
-            bodies.velocity[pair[1]] = bodies.velocity[pair[1]] + bodies.inverse_mass[pair[1]] * third_of(total, 0)
-            bodies.momentum[pair[1]] = bodies.momentum[pair[1]] + third_of(total, 2)
+        for k in range(2):
+            i, sign = pair[k], wp.where(k == 0, -ONE, ONE)
+            if bodies.motion_type[i] == DYNAMIC:
+                bodies.velocity[i] = bodies.velocity[i] + sign * (bodies.inverse_mass[i] * third_of(total, 0))
+                bodies.momentum[i] = bodies.momentum[i] + sign * third_of(total, 1 + k)
 
 
 @wp.func
@@ -253,12 +252,11 @@ def hand_on_impulses(p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constrai
             own = act_at_point(p, k, half, impulse, constraints)
         total = add_nine_in_order(total, own, wp.min(count - first, warp_size()))
     if warp_lane() == 0:
-        if bodies.motion_type[pair[0]] == DYNAMIC:
-            bodies.impulse[pair[0]] = bodies.impulse[pair[0]] - third_of(total, 0)
-            bodies.moment[pair[0]] = bodies.moment[pair[0]] - third_of(total, 1)
-        if bodies.motion_type[pair[1]] == DYNAMIC:
-            bodies.impulse[pair[1]] = bodies.impulse[pair[1]] + third_of(total, 0)
-            bodies.moment[pair[1]] = bodies.moment[pair[1]] + third_of(total, 2)
+        for k in range(2):
+            i, sign = pair[k], wp.where(k == 0, -ONE, ONE)
+            if bodies.motion_type[i] == DYNAMIC:
+                bodies.impulse[i] = bodies.impulse[i] + sign * third_of(total, 0)
+                bodies.moment[i] = bodies.moment[i] + sign * third_of(total, 1 + k)
     warp_sync()
 
 

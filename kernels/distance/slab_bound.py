@@ -9,7 +9,7 @@ size, so that such bounds err by the square of the size, where boxes err by the 
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.base.boxes import fuse32, map_point
+from warp_abtree.kernels.base.boxes import fuse32, map_point, reach_there
 from warp_abtree.kernels.base.nodes import Node, load_constant
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.base.quotients import normalize32, root32
@@ -79,16 +79,6 @@ def body_top(body: Body, n: wp.vec3):
         add_product(rest, body.sum, add_product(wp.abs(rest), body.size, 0.0)),
     )
     return wp.min(by_slab, add_product(n, body.sum, add_product(wp.abs(n), body.size, 0.0)))
-
-
-@wp.func
-def reach_there(rotation: wp.mat33, size: wp.vec3, margin: wp.float32):
-    """Return the width of a box's image in the other frame, widened by a margin on either side."""
-    reach = wp.vec3()
-    for i in range(3):
-        x = fuse32(wp.abs(rotation[i, 2]), size[2], margin + margin)
-        reach[i] = fuse32(wp.abs(rotation[i, 0]), size[0], fuse32(wp.abs(rotation[i, 1]), size[1], x))
-    return reach
 
 
 @wp.func

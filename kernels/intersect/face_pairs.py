@@ -4,6 +4,7 @@ import warp as wp
 
 from warp_abtree.kernels.base.arrays import ModelPool, Trees
 from warp_abtree.kernels.base.boxes import map_point
+from warp_abtree.kernels.base.counters import reserve_slot
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.exact.predicates import FLOAT32, UNCERTAIN
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair, load_near
@@ -140,27 +141,25 @@ def test_faces(mode: wp.int32, trees: Trees, pose: PairPose, face_a: wp.int32, f
 
 
 @wp.func
-def defer_uncertain(slot: wp.int32, pair: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
-    """Put a face pair on the list of uncertain ones, if there is room."""
-    if slot >= 0 and slot < hits.uncertain.shape[0]:
-        hits.uncertain[slot] = wp.vec3i(pair, face_a, face_b)
+def write_row(slot: wp.int32, row: wp.vec3i, rows: wp.array(dtype=wp.vec3i)):
+    """Put a face pair on a list, if there is room."""
+    if slot >= 0 and slot < rows.shape[0]:
+        rows[slot] = row
 
 
 @wp.func
-def list_apart(slot: wp.int32, pair: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
-    """Put a face pair on the list of those that are apart, if there is room."""
-    if slot >= 0 and slot < hits.apart.shape[0]:
-        hits.apart[slot] = wp.vec3i(pair, face_a, face_b)
+def append_row(flag: bool, row: wp.vec3i, total: wp.array(dtype=wp.int32), rows: wp.array(dtype=wp.vec3i)):
+    """Put the face pairs whose flag is set on a list, one a lane, as far as there is room. For all lanes of a warp."""
+    slot = reserve_slot(total, flag)
+    if flag:
+        write_row(slot, row, rows)
 
 
 @wp.func
 def report_hit(slot: wp.int32, pair: wp.int32, swapped: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
     """Write a hit in the order in which the pair names its objects, if there is room."""
-    if slot >= 0 and slot < hits.face.shape[0]:
-        if swapped != 0:
-            hits.face[slot] = wp.vec3i(pair, face_b, face_a)
-        else:
-            hits.face[slot] = wp.vec3i(pair, face_a, face_b)
+    row = wp.where(swapped != 0, wp.vec3i(pair, face_b, face_a), wp.vec3i(pair, face_a, face_b))
+    write_row(slot, row, hits.face)
 
 
 @wp.func

@@ -14,10 +14,9 @@ from warp_abtree.kernels.exact.predicates import UNCERTAIN
 from warp_abtree.kernels.intersect.face_pairs import (
     GAP,
     FoundHits,
-    defer_uncertain,
+    append_row,
     face_plane_signs,
     intersect_straddling_faces,
-    list_apart,
     report_hit,
 )
 from warp_abtree.kernels.search.item import OUTPUT_FACES, item_first, item_second
@@ -73,21 +72,17 @@ def test_straddling(
     item = read_item(own.items, STRADDLING_START + at)
     signs = read_signs(own.items, at)
     meet = intersect_straddling_faces(mode, trees, pose, item_first(item), item_second(item), signs)
+    row = wp.vec3i(pair, item_first(item), item_second(item))
     if mode == GAP:
-        apart = meet == 0 and lane < popped
-        slot = reserve_slot(hits.apart_total, apart)
-        if apart:
-            list_apart(slot, pair, item_first(item), item_second(item), hits)
+        append_row(meet == 0 and lane < popped, row, hits.apart_total, hits.apart)
     meet = wp.where(lane < popped, meet, 0)
     warp_sync()
     meets = meet == 1
     if output == OUTPUT_FACES:
         slot = reserve_slot(hits.total, meets)
         if meets:
-            report_hit(slot, pair, pose.swapped, item_first(item), item_second(item), hits)
+            report_hit(slot, pair, pose.swapped, row[1], row[2], hits)
     if meets:
         hits.any_hit[pair] = 1
-    slot = reserve_slot(hits.uncertain_total, meet == UNCERTAIN)
-    if meet == UNCERTAIN:
-        defer_uncertain(slot, pair, item_first(item), item_second(item), hits)
+    append_row(meet == UNCERTAIN, row, hits.uncertain_total, hits.uncertain)
     return meets, meet == UNCERTAIN

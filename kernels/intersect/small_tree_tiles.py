@@ -23,7 +23,7 @@ from warp_abtree.kernels.base.lanes import (
 from warp_abtree.kernels.base.nodes import load_constant_node
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.exact.predicates import UNCERTAIN
-from warp_abtree.kernels.intersect.face_pairs import Hits, defer_uncertain, report_hit
+from warp_abtree.kernels.intersect.face_pairs import Hits, report_hit, write_row
 from warp_abtree.kernels.search.item import OUTPUT_FACES
 from warp_abtree.kernels.search.warp_search import TraversalTests
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_near
@@ -237,7 +237,7 @@ def defer_faces(items: wp.uint64, uncertain: bool, faces: wp.int32, pair: wp.int
     slot = reserve_slot(hits.uncertain_total, uncertain)
     if uncertain:
         face_a, face_b = face_in_place(items, corners_of_a(faces)), face_in_place(items, corners_of_b(faces))
-        defer_uncertain(slot, pair, face_a, face_b, hits)
+        write_row(slot, wp.vec3i(pair, face_a, face_b), hits.uncertain)
 
 
 @wp.func

@@ -12,7 +12,7 @@ from warp_abtree.kernels.base.counters import count_flags, reserve_slot
 from warp_abtree.kernels.base.lanes import RESOLVE_WARPS, WARP_SIZE, resolve_lane, warp_size, warp_sync
 from warp_abtree.kernels.base.poses import PairBatch, PairPose, pose_point
 from warp_abtree.kernels.exact.predicates import EXACT, FLOAT32, UNCERTAIN
-from warp_abtree.kernels.intersect.face_pairs import Hits, list_apart, report_hit, test_faces
+from warp_abtree.kernels.intersect.face_pairs import Hits, append_row, report_hit, test_faces
 from warp_abtree.kernels.search.item import OUTPUT_ANY, OUTPUT_FACES
 from warp_abtree.kernels.search.warp_stack import push_signed_pair, read_signed_pair, signed_pairs
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair
@@ -48,9 +48,7 @@ def report_item(output: wp.int32, pair_poses: wp.array(dtype=PairPose), item: wp
 def list_apart_item(item: wp.vec3i, apart: bool, hits: Hits):
     """Put a face pair on the list of those that are apart where a gap is asked. For all threads of a warp."""
     if hits.gap.shape[0] > 0:
-        slot = reserve_slot(hits.apart_total, apart)
-        if apart:
-            list_apart(slot, item[0], item[1], item[2], hits)
+        append_row(apart, item, hits.apart_total, hits.apart)
 
 
 @wp.func
@@ -96,9 +94,7 @@ def resolve_list(
 def defer_inexact(hits: Hits, inexact: bool, item: wp.vec3i):
     """Put a face pair on the list that `resolve_inexact_kernel` works off. For all threads of a warp."""
     count_flags(hits.exact_tests, item[0], inexact)
-    slot = reserve_slot(hits.inexact_total, inexact)
-    if inexact:
-        hits.inexact[slot] = item
+    append_row(inexact, item, hits.inexact_total, hits.inexact)
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=80)

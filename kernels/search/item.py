@@ -58,58 +58,26 @@ def first_item(states: StatePool, pose: PairPose):
     return pack_item(load_node(states, pose.node_a + 1).skip, load_node(states, pose.node_b + 1).skip)
 
 
-@wp.struct
-class Child:
-    """A node in a node pair test: its box in both frames, and its place in the tree."""
-
-    box: PosedBox  # in its own frame and in the other one
-    span: wp.float32  # minus the sum of the box's extents; not negative at a leaf, whose face number its bits are
-    skip: wp.int32  # half an item that compares this node alone
-    down: wp.int32  # half an item that compares its children; not for a leaf
-    face: wp.int32  # face number of a leaf, negative at an inner node
-
-
 @wp.func
-def make_child(box: PosedBox, node: Node):
-    child = Child()
-    child.box = box
-    child.span = wp.cast(node.face, wp.float32)
-    child.skip = node.skip
-    child.down = children_of(node.skip)
-    child.face = node.face
-    return child
+def item_of(a: Node, b: Node):
+    """Return the item of two nodes: their faces, where both are leaves.
 
-
-@wp.func
-def child_of_a(pose: PairPose, node: Node):
-    back = wp.transpose(pose.rotation32)
-    return make_child(pose_box(node.lower, node.upper, back, pose.back32, pose.margin), node)
-
-
-@wp.func
-def child_of_b(pose: PairPose, node: Node):
-    return make_child(pose_box(node.lower, node.upper, pose.rotation32, pose.translation32, pose.margin), node)
-
-
-@wp.func
-def next_item(a: Child, b: Child):
-    """Return the item that two overlapping children emit: their faces, where both are leaves.
-
-    Else the next test goes down both, or only the one that is more than twice as large as the other, or no leaf.
+    Else the next step goes down both, or only the one that is more than twice as large as the other, or no leaf.
     """
     # `face` is negative for inner nodes, so the OR of both is negative unless both are leaves. A leaf beside a larger
     # box, whose span is negative, never goes down.
     leaves = (a.face | b.face) >= 0
-    x = wp.where(leaves, a.face, wp.where(a.span + a.span <= b.span, a.down, a.skip))
-    y = wp.where(leaves, b.face, wp.where(b.span + b.span <= a.span, b.down, b.skip))
+    span_a, span_b = wp.cast(a.face, wp.float32), wp.cast(b.face, wp.float32)
+    x = wp.where(leaves, a.face, wp.where(span_a + span_a <= span_b, children_of(a.skip), a.skip))
+    y = wp.where(leaves, b.face, wp.where(span_b + span_b <= span_a, children_of(b.skip), b.skip))
     return pack_item(x, y)
 
 
 @wp.func
-def list_of_pair(used: wp.int32, inner: wp.int32, a: Child, b: Child):
+def list_of_pair(used: wp.int32, inner: wp.int32, faces: wp.int32, a: PosedBox, b: PosedBox):
     """Return the list that a pair of children goes to, TO_NONE unless they overlap and `used` is negative."""
-    to = wp.where((a.face | b.face) >= 0, TO_LEAF_PAIRS, inner)
-    return wp.where(boxes_overlap(a.box, b.box), wp.where(used < 0, to, TO_NONE), TO_NONE)
+    to = wp.where(faces >= 0, TO_LEAF_PAIRS, inner)
+    return wp.where(boxes_overlap(a, b), wp.where(used < 0, to, TO_NONE), TO_NONE)
 
 
 @wp.func
@@ -130,7 +98,6 @@ def compare_node_pair(states: StatePool, pose: PairPose, floor: wp.vec2i, item: 
     Args:
         floor: `PairPose.floor`, or NO_NODE.
         live: -1, or 0 where nothing is asked of the item, which still names nodes.
-
     """
     x = item_first(item)
     y = item_second(item)
@@ -138,38 +105,26 @@ def compare_node_pair(states: StatePool, pose: PairPose, floor: wp.vec2i, item: 
     two_b = wp.where(y < 0, 1, 0)
     at_a = pose.node_a + (x & INDEX_MASK)
     at_b = pose.node_b + (y & INDEX_MASK)
-    node_a0 = load_constant_node(states, at_a)
-    node_a1 = load_constant_node(states, at_a + two_a)
-    node_b0 = load_constant_node(states, at_b)
-    node_b1 = load_constant_node(states, at_b + two_b)
-    a0 = child_of_a(pose, node_a0)
-    a1 = child_of_a(pose, node_a1)
-    b0 = child_of_b(pose, node_b0)
-    b1 = child_of_b(pose, node_b1)
+    a0 = load_constant_node(states, at_a)
+    a1 = load_constant_node(states, at_a + two_a)
+    b0 = load_constant_node(states, at_b)
+    b1 = load_constant_node(states, at_b + two_b)
+    items = four_items(item_of(a0, b0), item_of(a0, b1), item_of(a1, b0), item_of(a1, b1))
+    back = wp.transpose(pose.rotation32)
+    box_a0 = pose_box(a0.lower, a0.upper, back, pose.back32, pose.margin)
+    box_a1 = pose_box(a1.lower, a1.upper, back, pose.back32, pose.margin)
+    box_b0 = pose_box(b0.lower, b0.upper, pose.rotation32, pose.translation32, pose.margin)
+    box_b1 = pose_box(b1.lower, b1.upper, pose.rotation32, pose.translation32, pose.margin)
     used = wp.vec4i(live, y & live, x & live, x & y & live)
     inner = wp.where(have_slabs(floor, item), TO_SLAB_PAIRS, TO_STACK)
     lists = wp.vec4i(
-        list_of_pair(used[0], inner, a0, b0),
-        list_of_pair(used[1], inner, a0, b1),
-        list_of_pair(used[2], inner, a1, b0),
-        list_of_pair(used[3], inner, a1, b1),
+        list_of_pair(used[0], inner, a0.face | b0.face, box_a0, box_b0),
+        list_of_pair(used[1], inner, a0.face | b1.face, box_a0, box_b1),
+        list_of_pair(used[2], inner, a1.face | b0.face, box_a1, box_b0),
+        list_of_pair(used[3], inner, a1.face | b1.face, box_a1, box_b1),
     )
-    items = four_items(next_item(a0, b0), next_item(a0, b1), next_item(a1, b0), next_item(a1, b1))
     # Of one node or two of A times one or two of B.
     return items, lists, live & ((1 + two_a) << two_b)
-
-
-@wp.func
-def item_of(a: Node, b: Node):
-    """Return the item of two nodes: their faces, where both are leaves.
-
-    Else the next step goes down both, or only the one that is more than twice as large as the other, or no leaf.
-    """
-    leaves = (a.face | b.face) >= 0
-    span_a, span_b = wp.cast(a.face, wp.float32), wp.cast(b.face, wp.float32)
-    x = wp.where(leaves, a.face, wp.where(span_a + span_a <= span_b, children_of(a.skip), a.skip))
-    y = wp.where(leaves, b.face, wp.where(span_b + span_b <= span_a, children_of(b.skip), b.skip))
-    return pack_item(x, y)
 
 
 @wp.struct

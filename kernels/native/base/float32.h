@@ -59,6 +59,9 @@ struct Float32 {
     typedef bits integers;
     static constexpr int LANES = 16;
     typedef bool flags __attribute__((ext_vector_type(16)));
+    typedef float loose __attribute__((vector_size(64), aligned(4)));
+    typedef wp::int64 longs __attribute__((vector_size(64)));
+    typedef wp::int64 loose_longs __attribute__((vector_size(64), aligned(8)));
     typedef float four __attribute__((vector_size(16)));
     typedef float eight __attribute__((vector_size(32)));
     typedef int eight_ints __attribute__((vector_size(32)));
@@ -123,6 +126,29 @@ struct Float32 {
     }
     static bits widen(unsigned int mask) {
         return -__builtin_convertvector(__builtin_bit_cast(flags, (unsigned short)mask), bits);
+    }
+    // Put what a mask names behind a list, of which as many places as there are lanes are written over. No branch
+    // depends on a single one: it could not be predicted, and what follows would wait for the longest chain of
+    // operations.
+    static void append(float* list, const lanes& x, unsigned int which) {
+#if defined(__AVX512VL__)
+        *(loose*)list = __builtin_ia32_compresssf512_mask(x, lanes{}, which);
+#else
+        for (; which != 0; which &= which - 1)
+            *list++ = x[__builtin_ctz(which)];
+#endif
+    }
+    static void append(wp::int64* list, const longs& x, unsigned int which) {
+#if defined(__AVX512VL__)
+        *(loose_longs*)list = __builtin_ia32_compressdi512_mask(x, longs{}, which);
+#else
+        for (; which != 0; which &= which - 1)
+            *list++ = x[__builtin_ctz(which)];
+#endif
+    }
+    static void append(wp::int64* list, const longs& low, const longs& high, unsigned int which) {
+        append(list, low, which & 255);
+        append(list + __builtin_popcount(which & 255), high, which >> 8);
     }
     // Rows of four numbers, each where so many pairs of numbers end.
     static Point gather(const void* table, const sixteen& start) {

@@ -28,7 +28,6 @@ struct Lanes64 {
 };
 
 struct Float64 : Points64<Lanes64> {
-    typedef wp::int64 loose_longs __attribute__((vector_size(64), aligned(8)));
     typedef int ints __attribute__((vector_size(32)));
     typedef int loose_ints __attribute__((vector_size(32), aligned(4)));
     typedef double four __attribute__((vector_size(32), aligned(8)));
@@ -52,16 +51,7 @@ struct Float64 : Points64<Lanes64> {
                      __builtin_shufflevector(high_01, high_23, 0, 1, 4, 5, 8, 9, 12, 13),
                      __builtin_shufflevector(low_01, low_23, 2, 3, 6, 7, 10, 11, 14, 15)};
     }
-    // Put what a mask names on a list, of which eight places are written over. No branch depends on a single pair of
-    // faces: it could not be predicted, and what follows it would wait for the longest chain of operations.
-    static void append(wp::int64* list, const bits& item, unsigned int which) {
-#if defined(__AVX512VL__)
-        *(loose_longs*)list = __builtin_ia32_compressdi512_mask(item, bits{}, which);
-#else
-        for (int n = 0; which != 0; which &= which - 1)
-            list[n++] = item[__builtin_ctz(which)];
-#endif
-    }
+    // As `Float32::append`.
     static void append_ints(int* list, const ints& item, unsigned int which) {
 #if defined(__AVX512VL__)
         *(loose_ints*)list = __builtin_ia32_compresssi256_mask(item, ints{}, which);

@@ -1,6 +1,7 @@
 // Bounds of the distances of 16 pairs of boxes at a time, those of four items: as `bound_children` one by one.
 #pragma once
 #include "builtin.h"
+#include "base/float32.h"
 #include "distance/slab_bounds.h"
 #include "search/siblings.h"
 
@@ -8,10 +9,7 @@ struct NearBoxes : SlabBounds {
     // Lanes are two siblings of one tree as they lie in memory; or a number each of A's eight nodes, then of B's.
     typedef float loose __attribute__((vector_size(64), aligned(16)));
     typedef int bits __attribute__((vector_size(64)));
-    typedef wp::int64 longs __attribute__((vector_size(64)));
-    typedef wp::int64 loose_longs __attribute__((vector_size(64), aligned(8)));
-    typedef float loose_lanes __attribute__((vector_size(64), aligned(4)));
-    typedef bool flags __attribute__((ext_vector_type(16)));
+    typedef Float32::longs longs;
     typedef Siblings Taken;
     // 16 pairs of children: bounds, items that follow, and which are in use and which are faces, a bit each.
     struct Tested {
@@ -55,9 +53,6 @@ struct NearBoxes : SlabBounds {
     static lanes square_gap(const lanes& x, const lanes& reach) {
         const lanes over = __builtin_elementwise_abs(x) - reach, gap = over > 0.0f ? over : lanes{};
         return gap * gap;
-    }
-    static unsigned int to_mask(const bits& which) {
-        return (unsigned int)__builtin_bit_cast(unsigned short, __builtin_convertvector(which, flags));
     }
     // A node's eight numbers, of A's nodes in order, then of B's.
     static void turn(const Taken (&taken)[4], wp::int64 offset, lanes (&field)[8]) {
@@ -125,28 +120,7 @@ struct NearBoxes : SlabBounds {
         tested.high =
             (longs)__builtin_shufflevector(y, x, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
         tested.used = taken[0].used | taken[1].used << 4 | taken[2].used << 8 | taken[3].used << 12;
-        tested.leaves = 0xffff & ~to_mask(inner);
+        tested.leaves = 0xffff & ~Float32::to_mask(inner);
         return tested;
-    }
-    // Put what a mask names on a list, of which 16 places are written over.
-    static void append_items(wp::int64* list, const Tested& tested, unsigned int which) {
-#if defined(__AVX512VL__)
-        *(loose_longs*)list = __builtin_ia32_compressdi512_mask(tested.low, longs{}, which & 255);
-        *(loose_longs*)(list + __builtin_popcount(which & 255)) =
-            __builtin_ia32_compressdi512_mask(tested.high, longs{}, which >> 8);
-#else
-        for (int n = 0; which != 0; which &= which - 1) {
-            const int k = __builtin_ctz(which);
-            list[n++] = k < 8 ? tested.low[k] : tested.high[k - 8];
-        }
-#endif
-    }
-    static void append_bounds(float* list, const lanes& x, unsigned int which) {
-#if defined(__AVX512VL__)
-        *(loose_lanes*)list = __builtin_ia32_compresssf512_mask(x, lanes{}, which);
-#else
-        for (int n = 0; which != 0; which &= which - 1)
-            list[n++] = x[__builtin_ctz(which)];
-#endif
     }
 };

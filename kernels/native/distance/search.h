@@ -89,14 +89,13 @@ bool search_nearest(const Trees& trees, const PairPose& pose, const SearchScale&
             for (int i = 0; 4 * i < count; ++i) {
                 const NearBoxes::Tested tested = boxes.test(taken[i]);
                 node_tests += __builtin_popcount(tested.used);
-                const unsigned int near = tested.used & NearBoxes::to_mask(tested.bound <= limits.limit);
-                const unsigned int nodes = near & ~tested.leaves,
-                                   first = nodes & NearBoxes::to_mask(tested.bound <= now);
-                NearBoxes::append_items(m.item + top, tested, first);
-                NearBoxes::append_bounds(m.bound + top, tested.bound, first);
-                NearBoxes::append_items(m.later + later, tested, nodes & ~first);
-                NearBoxes::append_bounds(m.later_bound + later, tested.bound, nodes & ~first);
-                NearBoxes::append_items(m.face + waiting, tested, near & tested.leaves);
+                const unsigned int near = tested.used & Float32::to_mask(tested.bound <= limits.limit);
+                const unsigned int nodes = near & ~tested.leaves, first = nodes & Float32::to_mask(tested.bound <= now);
+                Float32::append(m.item + top, tested.low, tested.high, first);
+                Float32::append(m.bound + top, tested.bound, first);
+                Float32::append(m.later + later, tested.low, tested.high, nodes & ~first);
+                Float32::append(m.later_bound + later, tested.bound, nodes & ~first);
+                Float32::append(m.face + waiting, tested.low, tested.high, near & tested.leaves);
                 const int end = top + __builtin_popcount(first);
                 later += __builtin_popcount(nodes & ~first);
                 waiting += __builtin_popcount(near & tested.leaves);

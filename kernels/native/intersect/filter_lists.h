@@ -1,6 +1,7 @@
 // Lists of face pairs that the float64 filter has decided, each with room for 8 more.
 #pragma once
 #include "builtin.h"
+#include "base/float32.h"
 #include "base/float64.h"
 
 // Those that meet, those that are still open and, unless null, those that are apart; and how long the lists are.
@@ -12,15 +13,15 @@ struct FilterLists {
     void keep_apart(const F::bits& item, unsigned int which) {
         if (beside == nullptr)
             return;
-        F::append(beside + apart, item, which);
+        Float32::append(beside + apart, item, which);
         apart += __builtin_popcount(which);
     }
     void keep_hits(const F::bits& item, unsigned int which) {
-        F::append(hits + met, item, which);
+        Float32::append(hits + met, item, which);
         met += __builtin_popcount(which);
     }
     void keep_open(const F::bits& item, unsigned int which) {
-        F::append(rest + open, item, which);
+        Float32::append(rest + open, item, which);
         open += __builtin_popcount(which);
     }
 };

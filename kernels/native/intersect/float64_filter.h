@@ -30,7 +30,7 @@ struct Float64Filter {
         const bits some = bits{} + items[0];
         for (int i = 0; i < count; i += 8) {
             const bits lane = {0, 1, 2, 3, 4, 5, 6, 7};
-            const bits item = lane < count - i ? (bits) * (const F::loose_longs*)(items + i) : some;
+            const bits item = lane < count - i ? (bits) * (const Float32::loose_longs*)(items + i) : some;
             const counts face[2] = {2 * (counts)(pose.corner_a + __builtin_convertvector(item >> 32, ints)),
                                     2 * (counts)(pose.corner_b + __builtin_convertvector(item, ints))};
             for (int k = 0; k < 2; ++k) {
@@ -72,7 +72,7 @@ struct Float64Filter {
         const Point p1 = F::gather(position, rotated[0] + first), q1 = F::gather(position, rotated[1] + first);
         const Point r1 = F::gather(position, rotated[2] + first), p2 = gather_posed(rotated[3] + first);
         const Point q2 = gather_posed(rotated[4] + first), r2 = gather_posed(rotated[5] + first);
-        const bits item = *(const F::loose_longs*)(straddling + first);
+        const bits item = *(const Float32::loose_longs*)(straddling + first);
         const Point p1p2 = F::minus(p1, p2);
         const Sign start =
             F::orient_edges(p1p2, F::minus(p1, q2), F::minus(q1, p2), F::minus(q1, q2), F::minus(p2, q2));
@@ -152,7 +152,7 @@ void simd_float64_filter(const Trees& trees, const PairPose& pose, bool first_en
         const int at = done % at_once;
         if (at == 0)
             filter.find_corners(items + done, waiting - done < at_once ? waiting - done : at_once, start);
-        const bits item = *(const F::loose_longs*)(items + done);
+        const bits item = *(const Float32::loose_longs*)(items + done);
         done += count;
         Point d[3][3], d_size[3][3];
         filter.find_differences(start, at, d, d_size);
@@ -187,7 +187,7 @@ void simd_float64_filter(const Trees& trees, const PairPose& pose, bool first_en
         Filter::rotate(alone_b, alone_a.back, start[3] + at, start[4] + at, start[5] + at, order + 3);
         for (int i = 0; i < 6; ++i)
             F::append_ints(rotated[i] + kept, order[i], left);
-        F::append(straddling + kept, item, left);
+        Float32::append(straddling + kept, item, left);
         kept += __builtin_popcount(left);
         const bool last = first_ends || done == waiting;
         if (last || kept > STRADDLING_ROOM - 16)

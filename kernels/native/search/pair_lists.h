@@ -18,7 +18,7 @@ struct PairLists {
         const int wanted = most < fits ? most : fits;
         return wanted < end ? wanted : end;
     }
-    // As `next_item`, of the pairs that a mask names: of A for the four pairs, then of B.
+    // As `item_of`, of the pairs that a mask names: of A for the four pairs, then of B.
     __attribute__((always_inline)) void append(const ints& skip, const ints& face, unsigned int mask) {
         const ints other = __builtin_shufflevector(face, face, 4, 5, 6, 7, 0, 1, 2, 3);
         const eight span = (eight)face, other_span = (eight)other;

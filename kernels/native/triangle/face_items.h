@@ -8,30 +8,19 @@ struct FaceItems {
     typedef F::bits bits;
     typedef F::Point Point;
     typedef unsigned int counts __attribute__((vector_size(64)));
-    typedef int loose __attribute__((vector_size(64), aligned(4)));
-    typedef wp::int64 longs __attribute__((vector_size(64)));
+    typedef F::longs longs;
     longs low, high;
 
     // The first item in the place of those that lack.
     __attribute__((always_inline)) FaceItems(const wp::int64* items, int count) {
         const longs lane = {0, 1, 2, 3, 4, 5, 6, 7}, some = longs{} + items[0];
-        low = lane < count ? (longs) * (const loose*)items : some;
-        high = lane + 8 < count ? (longs) * (const loose*)(items + 8) : some;
+        low = lane < count ? *(const F::loose_longs*)items : some;
+        high = lane + 8 < count ? *(const F::loose_longs*)(items + 8) : some;
     }
     // Put what a mask names behind a list, of which so many more places are written over; return how many.
     __attribute__((always_inline)) int append(wp::int64* list, unsigned int which) const {
-        const int count = __builtin_popcount(which);
-#if defined(__AVX512VL__)
-        *(loose*)list = (loose)__builtin_ia32_compressdi512_mask(low, longs{}, which);
-        *(loose*)(list + __builtin_popcount(which & 255)) =
-            (loose)__builtin_ia32_compressdi512_mask(high, longs{}, which >> 8);
-#else
-        for (; which != 0; which &= which - 1) {
-            const int i = __builtin_ctz(which);
-            *list++ = i < 8 ? low[i] : high[i - 8];
-        }
-#endif
-        return count;
+        F::append(list, low, high, which);
+        return __builtin_popcount(which);
     }
     // Corners, each in the frame of its own model.
     template <class Trees, class PairPose>
