@@ -38,7 +38,7 @@ from warp_abtree.kernels.base.poses import (
     reach_box,
     sum_products,
 )
-from warp_abtree.kernels.search.item import pack_item
+from warp_abtree.kernels.search.item import item_first, item_second, pack_item
 from warp_abtree.kernels.search.load_balance import NO_UNIT, Work
 from warp_abtree.kernels.search.mean_slabs import Slabs, count_uses
 from warp_abtree.kernels.triangle.corners import load_triangles
@@ -215,7 +215,7 @@ def start_pair(p: wp.int32, trees: Trees, batch: PairBatch, found: NearestFound)
         bound = wp.float64(wp.inf)
     faces = found.faces[p]
     kept = NO_FACES
-    face_a, face_b = wp.int32(faces >> wp.int64(32)), wp.int32(faces & wp.int64(0x7FFFFFFF))
+    face_a, face_b = item_first(faces), item_second(faces)
     if is_active(trees, trees.objects.state[a], face_a) and is_active(trees, trees.objects.state[b], face_b):
         triangles = load_triangles(trees, pose, face_a, face_b)
         d = triangle_distance(triangles)

@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, flag
+from warp_abtree.checks.cpu_threads import core_count, cores_for
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
@@ -135,6 +136,16 @@ class Operator(DeviceMemory):
     def uses_warps(self) -> bool:
         """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
         return self.regime.uses_warps(self.device)
+
+    def threads(self, pairs: int) -> int:
+        """Return how many threads of the CPU have memory of their own, for so many pairs; none where warps work."""
+        return 0 if self.uses_warps() else min(pairs, self.regime.cpu_threads or core_count())
+
+    def cores(self, least: int, threads: int) -> int:
+        """Return how many cores share a launch, of so many pairs each at least; one where warps do, or for a graph."""
+        if self.uses_warps() or self.device.is_capturing:
+            return 1
+        return cores_for(self.rooms.pairs, least, threads)
 
     def _make(self, rooms: Rooms) -> list:
         """Return (owner, attribute, new array) of all that other rooms take, before anything is replaced."""

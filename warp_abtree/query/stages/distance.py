@@ -47,7 +47,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import flag, to_numpy
-from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
+from warp_abtree.checks.cpu_threads import launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.base.lanes import WARP_SIZE
@@ -146,7 +146,6 @@ class DistanceStage(Stage):
         """Return what has an entry a pair, a thread, or a node of the tree states that there are now."""
         pairs, operator, found = rooms.pairs, self.operator, self.found
         warps = operator.uses_warps()
-        threads = 0 if warps else min(pairs, operator.regime.cpu_threads or core_count())
         return [
             *fields(found, pairs, distance=wp.float64, scaling=frame.SearchScale, beyond=wp.float64),
             Array(found, "faces", wp.int64, pairs, int(frame.NO_FACES)),
@@ -155,7 +154,7 @@ class DistanceStage(Stage):
             *fields(self.distances, pairs, points=report.two_points, faces=wp.vec2i),
             *fields(self.distances, pairs if self._with_points else 0, gradient=report.two_twists),
             Array(self.slabs, "states", wp.vec2i, pairs),
-            Array(self, "memory", wp.float32, (threads, search_simd.NEAREST_WORDS)),
+            Array(self, "memory", wp.float32, (operator.threads(pairs), search_simd.NEAREST_WORDS)),
             *self._slab_arrays(),
         ]
 
@@ -196,7 +195,7 @@ class DistanceStage(Stage):
         if operator.device.is_capturing:
             operator.launch_all("distances", self._make_distances)
         else:
-            cores = self._cores()
+            cores = operator.cores(PAIRS_A_CORE, len(self.memory))
             given = cores == 1, *operator.guard.given()
             *first, last = operator.commands.find("distances", given, self._make_distances)
             for command in first:
@@ -211,13 +210,6 @@ class DistanceStage(Stage):
         if self._with_points:
             inputs = [operator.batch.trees, operator.pair_batch, self.distances]
             operator.launch_kernel(gradient.find_gradient_kernel, operator.rooms.pairs, inputs, WARP_SIZE)
-
-    def _cores(self) -> int:
-        """Return how many cores share the search; a graph of the CPU has one."""
-        operator = self.operator
-        if operator.uses_warps() or operator.device.is_capturing:
-            return 1
-        return cores_for(operator.rooms.pairs, PAIRS_A_CORE, len(self.memory))
 
     def _make_crossings(self, launch) -> list:
         """Make the launches that find points of pairs that intersect, see `Commands.find`."""
@@ -251,8 +243,8 @@ class DistanceStage(Stage):
         posed, hits, found, slabs = [operator.batch.trees, operator.pair_batch], operator.hits, self.found, self.slabs
         traversal, work = operator.traversal, operator.traversal.work
         if not operator.uses_warps():
-            made = []
-            for steps in [(True, True)] if self._cores() == 1 else [(True, False), (False, True)]:
+            made, alone = [], operator.cores(PAIRS_A_CORE, len(self.memory)) == 1
+            for steps in [(True, True)] if alone else [(True, False), (False, True)]:
                 request = search_simd.SearchRequest()
                 request.tolerances, (request.refreshes, request.searches) = self._tolerances, steps
                 inputs = [request, *posed, work.counter, slabs, found, hits, self.distances, self.memory]

@@ -24,7 +24,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, flag, to_numpy
-from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
+from warp_abtree.checks.cpu_threads import launch_on_cores
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.base.lanes import WARP_SIZE
@@ -118,12 +118,11 @@ class FirstContactStage(Stage):
 
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return what has an entry a pair or a thread."""
-        operator, pairs = self.operator, rooms.pairs
-        threads = 0 if operator.uses_warps() else min(pairs, operator.regime.cpu_threads or core_count())
+        pairs = rooms.pairs
         return [
             *fields(self.contacts, pairs, time=wp.float64, end=wp.int32),
             Array(self, "motion", self._kind, pairs),
-            Array(self, "memory", wp.int64, (threads, search.LIST_WORDS)),
+            Array(self, "memory", wp.int64, (self.operator.threads(pairs), search.LIST_WORDS)),
         ]
 
     def search(self):
@@ -139,10 +138,7 @@ class FirstContactStage(Stage):
         """Do the second half of `search`: follow motions to the first contacts. Launches only."""
         operator = self.operator
         (launch,) = operator.find_launches("first contacts", self._make_contacts)
-        if operator.device.is_capturing or operator.uses_warps():
-            launch()
-        else:
-            launch_on_cores(launch, cores_for(operator.rooms.pairs, PAIRS_A_CORE, len(self.memory)))
+        launch_on_cores(launch, operator.cores(PAIRS_A_CORE, len(self.memory)))
 
     def _make_motions(self, launch) -> list:
         operator = self.operator

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
+from warp_abtree.checks.cpu_threads import launch_on_cores
 from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.contacts import near_search
 from warp_abtree.kernels.distance import within
@@ -152,11 +152,9 @@ class Traversal:
 
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return what each thread of the CPU keeps slabs in; the system gives it only what it touches."""
-        operator, threads, words = self.operator, 0, 0
-        if not operator.uses_warps():
-            threads = min(rooms.pairs, operator.regime.cpu_threads or core_count())
-            words = descent.slab_memory_words(int(operator.batch.models.depth.max()))
-        clear = None if threads == 0 else _clear_slabs
+        threads = self.operator.threads(rooms.pairs)
+        words = descent.slab_memory_words(int(self.operator.batch.models.depth.max())) if threads else 0
+        clear = _clear_slabs if threads else None
         return [Array(self, "slab_memory", wp.float32, (threads, words), clear)]
 
     def warp_count(self) -> int:
@@ -173,14 +171,10 @@ class Traversal:
         return STACK_LENGTH if length is None else min(length, STACK_LENGTH)
 
     def _cores(self) -> int:
-        """Return how many cores share the traversal; a graph of the CPU has one."""
-        operator = self.operator
-        if operator.uses_warps() or operator.device.is_capturing:
-            return 1
         # A further core costs some 50 us: many pairs of "any"; else a pair in contact takes the root of its faces.
-        least = 32 if self._is_any else max(1, int(50 / math.sqrt(operator.batch.mean_faces)))
+        least = 32 if self._is_any else max(1, int(50 / math.sqrt(self.operator.batch.mean_faces)))
         # Each has memory for slabs: tests do not depend on which thread takes a pair.
-        return cores_for(operator.rooms.pairs, least, len(self.slab_memory))
+        return self.operator.cores(least, len(self.slab_memory))
 
     def launch(self, name: str, asked: AskedHits | AskedVisits, within: wp.array, hits, beside: Any = None):
         """Launch relative poses, the traversal, and passes over uncertain face pairs.
