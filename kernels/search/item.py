@@ -109,6 +109,7 @@ def compare_node_pair(states: StatePool, pose: PairPose, floor: wp.vec2i, item: 
     a1 = load_constant_node(states, at_a + two_a)
     b0 = load_constant_node(states, at_b)
     b1 = load_constant_node(states, at_b + two_b)
+    # Before the boxes: behind them the search for any hit spills registers.
     items = four_items(item_of(a0, b0), item_of(a0, b1), item_of(a1, b0), item_of(a1, b1))
     back = wp.transpose(pose.rotation32)
     box_a0 = pose_box(a0.lower, a0.upper, back, pose.back32, pose.margin)
