@@ -20,12 +20,25 @@ from warp_abtree.query.stages.points import make_twists
 
 
 def clip_area_vector(half, pose, other_half, other_pose):
-    """Area vector of that part of the faces of one box that lies within another, cut by its planes: an oracle."""
-    part = trimesh.creation.box(2 * half, to_matrix(quaternion_matrix(pose[3:]), pose[:3]))
-    for side, extent in zip(quaternion_matrix(other_pose[3:]).T, other_half):
-        for inwards in (-side, side):
-            part = part.slice_plane(other_pose[:3] - extent * inwards, inwards)
-    return (part.area_faces[:, None] * part.face_normals).sum(0)
+    """Area vector of that part of the faces of one box that lies within another, by clipping each face: an oracle."""
+    r, r2 = quaternion_matrix(pose[3:]), quaternion_matrix(other_pose[3:])
+    total, sides = np.zeros(3), list(itertools.product(range(3), (-1, 1)))
+    for axis, sign in sides:
+        corners = np.tile(sign * half.astype(float), (4, 1))
+        corners[:, [axis - 2, axis - 1]] = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half[[axis - 2, axis - 1]]
+        polygon = [r2.T @ (r @ corner + pose[:3] - other_pose[:3]) for corner in corners]
+        for k, s in sides:
+            kept = []
+            for p, q in zip(polygon, polygon[1:] + polygon[:1]):
+                at_p, at_q = other_half[k] - s * p[k], other_half[k] - s * q[k]
+                if at_p >= 0:
+                    kept.append(p)
+                if (at_p < 0) != (at_q < 0):
+                    kept.append(p + (q - p) * at_p / (at_p - at_q))
+            polygon = kept
+        for p, q in itertools.pairwise(polygon[1:]):
+            total += 0.5 * sign * np.linalg.norm(np.cross(p - polygon[0], q - polygon[0])) * r[:, axis]
+    return total
 
 
 def check_upward(points, tolerance=1e-9):
