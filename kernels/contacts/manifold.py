@@ -39,6 +39,8 @@ class Witnesses:
     nearest_only: wp.array(dtype=wp.int32)  # those whose points another face may be nearer to, in any order, [witness]
     nearest_total: wp.array(dtype=wp.int32)  # how many these are, shape [1]
     wrench: wp.array(dtype=wp.vec4)  # see `points`, shape [2 * COLUMN_CORNERS * witness]
+    chosen: wp.array2d(dtype=wp.int32)  # wrenches of the points of a pair, shape [pair, points]
+    place: wp.array2d(dtype=wp.vec3d)  # where these are [world units], shape [pair, points]
 
 
 @wp.struct

@@ -18,8 +18,6 @@ count as what they move. Separations count from the deepest candidate, if that i
 come apart as far as that. The number is the candidate's place among those of all contacts.
 """
 
-import functools
-
 import warp as wp
 
 from warp_abtree.kernels import native
@@ -31,8 +29,7 @@ from warp_abtree.kernels.contacts.manifold import Manifolds, Witnesses
 from warp_abtree.kernels.contacts.slots import WitnessRows, gap_of
 
 TWIST_COUNT, RANDOM_TWISTS = native.constant("TWIST_COUNT"), native.constant("RANDOM_TWISTS")
-MODULE_OPTIONS = native.options("contacts/twists.cuh") | {"block_dim": TWIST_COUNT}
-wp.set_module_options(MODULE_OPTIONS)
+wp.set_module_options(native.options("contacts/twists.cuh") | {"block_dim": TWIST_COUNT})
 
 # Part of the limit of motions that candidates may be taken in by.
 TOLERANCE = wp.constant(wp.float64(2.0**-10))
@@ -199,16 +196,10 @@ def number_of(wrench: wp.int32, witnesses: Witnesses):
 
 
 @wp.func
-def point_of(number: wp.int32, witnesses: Witnesses):
-    return witnesses.point[number / COLUMN_CORNERS, number % COLUMN_CORNERS]
-
-
-@wp.func
 def write_in_order(
     p: wp.int32,
     along: wp.vec3d,
     count: wp.int32,
-    chosen: wp.array(dtype=wp.int32),
     witnesses: Witnesses,
     manifolds: Manifolds,
 ):
@@ -216,13 +207,19 @@ def write_in_order(
 
     So points that stay keep their order from step to step, whichever was found first, and whatever face they are on.
     """
+    group_sync()
     k = group_lane()
     while k < count:
-        number = number_of(chosen[k], witnesses)
-        point = point_of(number, witnesses)
-        place = wp.int32(0)
+        number = number_of(witnesses.chosen[p, k], witnesses)
+        witnesses.place[p, k] = witnesses.point[number / COLUMN_CORNERS, number % COLUMN_CORNERS]
+        k += group_size()
+    group_sync()
+    k = group_lane()
+    while k < count:
+        number = number_of(witnesses.chosen[p, k], witnesses)
+        point, place = witnesses.place[p, k], wp.int32(0)
         for j in range(count):
-            ahead = wp.dot(along, point - point_of(number_of(chosen[j], witnesses), witnesses))
+            ahead = wp.dot(along, point - witnesses.place[p, j])
             if ahead > wp.float64(0.0) or (ahead == wp.float64(0.0) and j < k):
                 place += 1
         depth = witnesses.depth[number / COLUMN_CORNERS, number % COLUMN_CORNERS]
@@ -236,57 +233,50 @@ def write_in_order(
         manifolds.count[p] = count
 
 
-@functools.cache
-def point_chooser(most: int):
-    """Return the kernel that chooses the points of each pair, so many at most, by a block a pair."""
+@wp.kernel(launch_bounds=(TWIST_COUNT, 3))
+def choose_point_kernel(
+    objects: ObjectPool,
+    batch: PairBatch,
+    twists: wp.array(dtype=wp.float32),
+    gap: wp.array(dtype=wp.float64),
+    rows: WitnessRows,
+    witnesses_inout: Witnesses,
+    manifolds_out: Manifolds,
+):
+    """Choose the points of one pair.
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, launch_bounds=(TWIST_COUNT, 3))
-    def choose_point_kernel(
-        objects: ObjectPool,
-        batch: PairBatch,
-        twists: wp.array(dtype=wp.float32),
-        gap: wp.array(dtype=wp.float64),
-        rows: WitnessRows,
-        witnesses_inout: Witnesses,
-        manifolds_out: Manifolds,
-    ):
-        """Choose the points of one pair.
-
-        Args:
-            twists: As for `choose_by_twists`.
-            gap: Of each pair [world units], or [0] for none.
-        """
-        p = wp.tid() / group_size()
-        span = wp.vec2i(rows.start[p], rows.start[p] + rows.count[p])
-        if span[0] >= span[1]:
-            if group_lane() == 0:
-                manifolds_out.count[p] = 0
-            return
-        zero, shell = wp.float64(0.0), gap_of(gap, p)
-        a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
-        pose = ObjectPose()
-        pose.rotation = objects.rotation[a]
-        pose.position = objects.position[a]
-        pose.sense = wp.where(batch.pairs[p][0] == a, wp.float64(1.0), wp.float64(-1.0))
-        found = list_candidates(span, shell, pose, witnesses_inout)
-        chosen = wp.zeros(shape=(wp.static(most),), dtype=wp.int32)
-        count = wp.int32(0)
-        if found.first < found.end:
-            inside = wp.where(found.deepest == NO_DEPTH, zero, found.deepest)
-            deepest = wp.max(inside, zero)
-            limit = wp.float64(2.0) * (shell + deepest) + LEAST_MOTION * found.size
-            deep = (shell - DEEPER * (shell + inside)) + deepest
-            count = choose_by_twists(
-                witnesses_inout.wrench,
-                found.first,
-                found.end,
-                twists,
-                wp.float32(limit),
-                wp.float32(TOLERANCE * limit),
-                wp.float32(deep),
-                wp.static(most),
-                chosen,
-            )
-        write_in_order(p, order_direction(pose.rotation), count, chosen, witnesses_inout, manifolds_out)
-
-    return choose_point_kernel
+    Args:
+        twists: As for `choose_by_twists`.
+        gap: Of each pair [world units], or [0] for none.
+    """
+    p = wp.tid() / group_size()
+    span = wp.vec2i(rows.start[p], rows.start[p] + rows.count[p])
+    if span[0] >= span[1]:
+        if group_lane() == 0:
+            manifolds_out.count[p] = 0
+        return
+    zero, shell = wp.float64(0.0), gap_of(gap, p)
+    a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
+    pose = ObjectPose()
+    pose.rotation = objects.rotation[a]
+    pose.position = objects.position[a]
+    pose.sense = wp.where(batch.pairs[p][0] == a, wp.float64(1.0), wp.float64(-1.0))
+    found = list_candidates(span, shell, pose, witnesses_inout)
+    count = wp.int32(0)
+    if found.first < found.end:
+        inside = wp.where(found.deepest == NO_DEPTH, zero, found.deepest)
+        deepest = wp.max(inside, zero)
+        limit = wp.float64(2.0) * (shell + deepest) + LEAST_MOTION * found.size
+        deep = (shell - DEEPER * (shell + inside)) + deepest
+        count = choose_by_twists(
+            witnesses_inout.wrench,
+            found.first,
+            found.end,
+            twists,
+            wp.float32(limit),
+            wp.float32(TOLERANCE * limit),
+            wp.float32(deep),
+            witnesses_inout.chosen.shape[1],
+            witnesses_inout.chosen[p],
+        )
+    write_in_order(p, order_direction(pose.rotation), count, witnesses_inout, manifolds_out)

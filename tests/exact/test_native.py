@@ -136,7 +136,6 @@ def reached(adjoint, found):
 
 MAKERS = {
     "contacts.near_search": lambda made: [made.thread_near_search()],
-    "contacts.points": lambda made: [made.point_chooser(4)],
     "distance.within": lambda made: [make(made.PROVED_APART) for make in (made.thread_within, made.warp_within)],
     "intersect.dual_tree": lambda made: [made.warp_traversal(int(EXACT), False)],
     "intersect.relative_pose": lambda made: [made.relative_poses(False)],

@@ -146,10 +146,10 @@ struct TwistChoice {
     }
 };
 
-template <class Array>
-CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec4> wrenches, wp::int32 first, wp::int32 end,
-                                         wp::array_t<wp::float32> twists, wp::float32 limit, wp::float32 tolerance,
-                                         wp::float32 deep, wp::int32 most, Array chosen) {
+inline CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec4> wrenches, wp::int32 first, wp::int32 end,
+                                                wp::array_t<wp::float32> twists, wp::float32 limit,
+                                                wp::float32 tolerance, wp::float32 deep, wp::int32 most,
+                                                wp::array_t<wp::int32> chosen) {
     typedef TwistChoice T;
     const T choice = {wrenches, first, end};
     // The nearest candidate, which must be among those chosen or about as near as one; and that whose normal is most

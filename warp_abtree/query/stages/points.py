@@ -128,6 +128,7 @@ class PointStage(Stage):
             *fields(witnesses, room, normal=wp.vec3d, nearest_only=wp.int32),
             Array(witnesses, "nearest_total", wp.int32, 1, 0),
             Array(witnesses, "wrench", wp.vec4, 2 * CANDIDATES * room),
+            *fields(witnesses, (rooms.pairs, self.point_max), chosen=wp.int32, place=wp.vec3d),
             *(near if self._with_gap else []),
             Array(self.manifolds, "count", wp.int32, rooms.pairs, 0),
             *fields(self.manifolds, (rooms.pairs, self.point_max), **self._fields, **self._kept),
@@ -184,8 +185,7 @@ class PointStage(Stage):
         operator, room = self.operator, self.operator.rooms.pairs
         block = point_kernels.TWIST_COUNT if operator.device.is_cuda else 1
         inputs = [*given, self._slots.rows, self.witnesses, self.manifolds]
-        chooser = point_kernels.point_chooser(self.point_max)
-        operator.launch_kernel(chooser, room * block, inputs, point_kernels.TWIST_COUNT)
+        operator.launch_kernel(point_kernels.choose_point_kernel, room * block, inputs, point_kernels.TWIST_COUNT)
 
     def _add_inside_points(self):
         """Add points of what is inside, where there are solids. Launches only."""
