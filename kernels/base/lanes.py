@@ -68,7 +68,7 @@ def warp_lane() -> wp.int32: ...
 
 @native.func_native()
 def resolve_lane() -> wp.int32:
-    """Return the lane of a warp in a block of several."""
+    """Return the lane of a warp in a block of several, or where the compiler should know that it is below 32."""
 
 
 @native.func_native()

@@ -18,9 +18,9 @@ from warp_abtree.kernels.base.lanes import (
     WARP_SIZE,
     count_set_bits,
     lane_in_turn,
+    resolve_lane,
     vector_of_lane,
     warp_any,
-    warp_lane,
     warp_max,
     warp_size,
     warp_sync,
@@ -104,7 +104,7 @@ def visit_points(
         if lanes == 1:
             point = relaxed[p, k]
         else:
-            k = warp_lane()
+            k = resolve_lane()
         along, across = relax_point(point, own, wp.float32(relaxation.friction))
         more, slides = along - point.along, across - point.across
         acts = k < count and point_of_turn(k, count, backward) >= turn and (more != 0.0 or wp.norm_l1(slides) != 0.0)
@@ -116,7 +116,7 @@ def visit_points(
             turn = point_of_turn(k, count, backward) + 1
             impulse = more * point.normal + slides
             moment_a, moment_b = wp.cross(point.arm_a, impulse), wp.cross(point.arm_b, impulse)
-            if lanes == 1 or warp_lane() == k:
+            if lanes == 1 or resolve_lane() == k:
                 much = much or wp.abs(more) > own.settled * point.mass
                 point.along = along
                 point.across = across
@@ -164,7 +164,7 @@ def relax_pair(
     own.corrects = stage == SOLVE and (relaxation.fast > ZERO or one_moves)
     own.struck = wp.where(stage == RELAX, constraints.is_struck[p], 0)
     point = RelaxedPoint()
-    for k in range(warp_lane(), count, lanes):
+    for k in range(resolve_lane(), count, lanes):
         point = load_point(relaxation, units, own, p, k, pair, manifolds, constraints, bodies)
         if lanes == 1:
             relaxed[p, k] = point
@@ -173,7 +173,7 @@ def relax_pair(
     units.per_speed = inverse_power(speed)
     units.impulse = units.mass * speed
     fastest = wp.float64(0.0)
-    for k in range(warp_lane(), count, lanes):
+    for k in range(resolve_lane(), count, lanes):
         if lanes == 1:
             point = relaxed[p, k]
         fastest = wp.max(fastest, start_point(point, units, p, k, pair, manifolds, constraints, bodies))
@@ -190,7 +190,7 @@ def relax_pair(
         if not at_all or (visit >= VISITS_LEAST and not much):
             visit = visits
     apply_impulses(units, p, pair, point, manifolds, constraints, bodies, relaxed)
-    if warp_lane() == 0:
+    if resolve_lane() == 0:
         constraints.is_struck[p] = own.struck
         if own.corrects:
             for k in range(2):
@@ -214,7 +214,7 @@ def apply_impulses(
     half = half_shift(pair, bodies)
     total = nine_numbers()
     for first in range(0, count, warp_size()):
-        own, k = nine_numbers(), first + warp_lane()
+        own, k = nine_numbers(), first + resolve_lane()
         if k < count:
             along, across = wp.float64(point.along) * unit, wp.vec3d(point.across) * unit
             if warp_size() == 1:
@@ -225,7 +225,7 @@ def apply_impulses(
             constraints.impulse[p, k] = along
             constraints.friction_impulse[p, k] = across
         total = add_nine_in_order(total, own, wp.min(count - first, warp_size()))
-    if warp_lane() == 0:
+    if resolve_lane() == 0:
         for k in range(2):
             i, sign = pair[k], wp.where(k == 0, -ONE, ONE)
             if bodies.motion_type[i] == DYNAMIC:
@@ -243,7 +243,7 @@ def hand_on_impulses(p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constrai
     half = half_shift(pair, bodies)
     total = nine_numbers()
     for first in range(0, count, warp_size()):
-        own, k = nine_numbers(), first + warp_lane()
+        own, k = nine_numbers(), first + resolve_lane()
         if k < count:
             if struck != 0:
                 constraints.impulse[p, k] = ZERO
@@ -251,7 +251,7 @@ def hand_on_impulses(p: wp.int32, pair: wp.vec2i, manifolds: Manifolds, constrai
             impulse = constraints.impulse[p, k] * manifolds.normal[p, k] + constraints.friction_impulse[p, k]
             own = act_at_point(p, k, half, impulse, constraints)
         total = add_nine_in_order(total, own, wp.min(count - first, warp_size()))
-    if warp_lane() == 0:
+    if resolve_lane() == 0:
         for k in range(2):
             i, sign = pair[k], wp.where(k == 0, -ONE, ONE)
             if bodies.motion_type[i] == DYNAMIC:
