@@ -33,8 +33,8 @@ struct TwistChoice {
     static constexpr float RIM = 0.95f;
     static constexpr int FEW_TWISTS = 8;
     static constexpr int UNKNOWN = -1;
-    // More than the rounding of a bound.
-    static constexpr float ROUNDING = 1.0f + 0x1p-20f;
+    // More than the rounding of a bound, and of one that is too small for all its digits.
+    static constexpr float ROUNDING = 1.0f + 0x1p-20f, TINY = 0x1p-146f;
     const wp::array_t<wp::vec4>& wrenches;
     int first, end;
     CUDA_CALLABLE Wrench get(int c) const {
@@ -123,7 +123,7 @@ struct TwistChoice {
     static CUDA_CALLABLE void block(Twists& t, const Wrench& c) {
         const lanes rate = rate_of(t, c), closing = -rate;
         const auto stops = (closing > 0x1p-20f) & (c.separation < t.stop * closing);
-        const lanes stop = stops ? c.separation / closing : t.stop, bound = t.worst * (stop / t.stop) * ROUNDING;
+        const lanes stop = stops ? c.separation / closing : t.stop, bound = t.worst * (stop / t.stop) * ROUNDING + TINY;
         t.worst = stops ? (bound > 0.0f ? bound : lanes{}) : t.worst;
         t.candidate = stops ? integers{} + UNKNOWN : t.candidate;
         t.stop = stop;
