@@ -244,3 +244,11 @@ def test_points_are_those_of_a_plain_choice(device, gap, most):
         np.testing.assert_allclose(result.points["point"], expected, atol=1e-9)
         counts.append(len(taken))
     assert max(counts) == most or max(counts) > 12, counts
+
+
+def test_motions_beyond_float32_choose_points(device):
+    """Within a gap whose double is infinite there: as many as within half of it, not those few of the first motion."""
+    ball = model_of(trimesh.creation.icosphere(subdivisions=2, radius=2e29))
+    placed = (ball, STILL), (ball, (1e38, 1e38, 1e38, 0, 0.6, 0, 0.8))
+    counts = [len(ask_points(device, *placed, gap=gap, points=64)[1].points["depth"]) for gap in (1.74e38, 3e38)]
+    assert counts == [64, 64]

@@ -124,7 +124,7 @@ struct TwistChoice {
         const lanes rate = rate_of(t, c), closing = -rate;
         const auto stops = (closing > 0x1p-20f) & (c.separation < t.stop * closing);
         const lanes stop = stops ? c.separation / closing : t.stop, bound = t.worst * (stop / t.stop) * ROUNDING + TINY;
-        t.worst = stops ? (bound > 0.0f ? bound : lanes{}) : t.worst;
+        t.worst = stops ? (bound <= 0.0f ? lanes{} : bound) : t.worst;
         t.candidate = stops ? integers{} + UNKNOWN : t.candidate;
         t.stop = stop;
     }
@@ -175,11 +175,11 @@ inline CUDA_CALLABLE wp::int32 choose_by_twists(wp::array_t<wp::vec4> wrenches, 
         float depth;
         int at;
         T::find_deepest(twist, depth, at);
-        // Of the others those that may be deeper, or as deep.
+        // Of the others those that may be deeper, or as deep: where motions have no limit nothing is known (NaN).
         bool found = false;
         for (int g = 0; g < T::GROUPS; ++g) {
-            const auto open =
-                (twist[g].candidate == T::UNKNOWN) & (twist[g].worst > tolerance) & (twist[g].worst >= depth);
+            const auto open = (twist[g].candidate == T::UNKNOWN) & ((twist[g].worst <= tolerance) == 0) &
+                              ((twist[g].worst < depth) == 0);
             found |= T::F::any(open);
             choice.find_worst_again(twist[g], open);
         }

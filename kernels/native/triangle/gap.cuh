@@ -32,8 +32,8 @@ struct WidestGap : Points64<Number> {
     Point direction;  // from A to B
 
     static CUDA_CALLABLE lanes minor_exactly(const lanes& a, const lanes& b, const lanes& c, const lanes& d) {
-        const lanes w = c * d;
-        return F::fuse(a, b, -w) - F::fuse(c, d, -w);
+        const lanes w = lanes{} - c * d;  // no zero has a sign
+        return F::fuse(a, b, w) - F::fuse(c, d, w);
     }
     static CUDA_CALLABLE Point cross_exactly(const Point& u, const Point& v) {
         return Point{minor_exactly(u.y, v.z, u.z, v.y), minor_exactly(u.z, v.x, u.x, v.z),
