@@ -266,11 +266,33 @@ def test_a_result_is_its_owners(device):
     """Whoever writes into one changes no later answer, also where the same pairs are asked again."""
     scene = in_a_row(device, "box", (0, 0.5, 5))
     for pairs in ([(0, 1), (0, 2)], [(1, 2), (1, 2)], [(1, 2), (1, 2)], [(0, 2), (0, 1)], [(0, 1)]):
-        result = scene.intersect(pairs)
-        assert result.pairs.tolist() == [list(pair) for pair in pairs]
-        assert result.any.tolist() == [pair == (0, 1) for pair in pairs]
-        result.pairs[:] = 1, 2
-        result.any[:] = True
+        for given in (pairs, np.array(pairs), np.array(pairs), pairs):
+            result = scene.intersect(given)
+            assert result.pairs.tolist() == [list(pair) for pair in pairs]
+            assert result.any.tolist() == [pair == (0, 1) for pair in pairs]
+            result.pairs[:] = 1, 2
+            result.any[:] = True
+
+
+def test_a_question_that_repeats_the_last_one_is_answered_anew(device):
+    """After other poses, pairs, outputs and options; a question that the last one could be is refused as ever."""
+    scene, pairs = in_a_row(device, "box", (0, 0.5, 5)), np.array([(0, 1)])
+    for place, meets in ((0.5, True), (0.5, True), (5.0, False), (0.5, True)):
+        scene.set_pose(1, [place, 0, 0, 0, 0, 0, 1])
+        assert scene.intersect(pairs).any.tolist() == [meets]
+        assert not scene.intersect(np.array([(0, 2)])).any
+    for ask in ({"output": "count"}, {}, {"within": 4.0}, {"precision": "float32"}, {"output": "faces"}):
+        for _ in range(2):
+            found = scene.intersect(pairs, **ask)
+            assert found.any.all() and (found.count is None) == ("output" not in ask)
+            assert (found.apart is None) == ("within" not in ask)
+    for bad, output in ((pairs[0], "any"), (pairs, "all"), (pairs.astype(float), "any"), (pairs + 3, "any")):
+        with pytest.raises(ValueError):
+            scene.intersect(bad, output)
+        assert scene.intersect(pairs).any.all()
+    scene.remove(1)
+    with pytest.raises(ValueError, match="removed"):
+        scene.intersect(pairs)
 
 
 def test_an_empty_scene(device):

@@ -14,9 +14,9 @@ from warp_abtree.query.request import Buffers
 from warp_abtree.query.stage import Array, Rooms, Stage
 from warp_abtree.query.stages.intersect import GapStage
 
-# Entries of the lists of hits, and of face pairs that may be near, beyond which parts of the pairs take turns: some 500
-# and 600 MB.
-HITS_AT_ONCE, UNCERTAIN_AT_ONCE = 2**21, 2**25
+# Entries of the lists of hits, and of face pairs that may be near, beyond which parts of the pairs take turns: some 600
+# and 500 MB.
+HITS_AT_ONCE, UNCERTAIN_AT_ONCE = 2**21, 7 * 2**22
 
 
 class PartGaps(GapStage):
@@ -61,8 +61,8 @@ class PointParts:
 
     def __init__(self, query: Any, stages: list[Any], pairs: int, hits: int, uncertain: int):
         self.count = min(pairs, max(-(-hits // HITS_AT_ONCE), -(-uncertain // UNCERTAIN_AT_ONCE)))
-        # Twice an even share: contacts are sorted, and looked at, as many as there is room for.
-        hits = min(hits, HITS_AT_ONCE, -(-2 * hits // self.count))
+        # Half as many again as an even share: contacts are sorted, and looked at, as many as there is room for.
+        hits = min(hits, HITS_AT_ONCE, -(-3 * hits // (2 * self.count)))
         rooms = Buffers(hits, -(-query.rooms.pairs // self.count), min(uncertain, UNCERTAIN_AT_ONCE) or None)
         self._gaps = next((stage for stage in stages if isinstance(stage, PartGaps)), None)
         self._points, self._lent = stages[-1], -1  # generation of the lists that the query has

@@ -49,6 +49,7 @@ class KeptQueries:
     def __init__(self, scene, find_pairs: Callable[[Any, float], np.ndarray]):
         self._scene, self._find_pairs = scene, find_pairs
         self.kept: dict[tuple, Any] = {}
+        self._last: tuple = (), ()  # question of `find`, and the key of the operator that is asked it
         self._originals: Originals | None = None
 
     def clear(self):
@@ -57,7 +58,23 @@ class KeptQueries:
         self._originals = None
 
     def find(self, pairs, output, precision, contact_dtype, options: dict, device: bool) -> Result:
-        """Answer `Scene.intersect`."""
+        """Answer `Scene.intersect`; a question without options that repeats the last one is not checked again."""
+        question: tuple = ()
+        if isinstance(pairs, np.ndarray) and all(value is None for value in options.values()):
+            if isinstance(output, str) and isinstance(precision, str):
+                question = output, precision, pairs.dtype, pairs.shape, pairs.tobytes()
+        last, key = self._last
+        query = self.kept.pop(key, None) if question and question == last else None
+        if query is None:
+            self._last = (), ()
+            key, query = self._take(pairs, output, precision, options)
+            self._last = question, key
+        if isinstance(query, ContactQuery):
+            query.contact_dtype = contact_dtype
+        return self._run(key, query, device)
+
+    def _take(self, pairs, output, precision, options: dict) -> tuple[tuple, Operator]:
+        """Return the operator that is to answer a question, with its key, taken out of those kept."""
         given = check_options(SCENE_OPTIONS, output, precision, options)
         tolerances, signed, of_originals = check_distance_options(given) if output == "distance" else ({}, False, False)
         distances = {name: to_numpy(given[name], name) for name in ("within", "gap", "beyond") if name in given}
@@ -91,9 +108,7 @@ class KeptQueries:
                 query.set_tolerance(**tolerances)
             if not query.is_asked(found, **checked):
                 query.replace_pairs(found, **checked)
-        if isinstance(query, ContactQuery):
-            query.contact_dtype = contact_dtype
-        return self._run(key, query, device)
+        return key, query
 
     def _find_originals(self) -> Originals:
         if self._originals is None:

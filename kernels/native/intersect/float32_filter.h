@@ -86,15 +86,17 @@ void simd_float32_filter(const Trees& trees, const PairPose& pose, wp::vec3 boun
         PlaneFilter::Heights of_a, of_b;
         filter.compare_planes(a, b, of_a, of_b);
         FilterSides sides_a = FilterSides::make(of_a), sides_b = FilterSides::make(of_b);
+        const unsigned int one_sided = sides_a.one_sided | sides_b.one_sided;
+        unsigned int all = (1u << count) - 1;
+        auto keep_near = [&](unsigned int which) { near_count += items.append(beside + near_count, which); };
         if (gap >= 0.0f) {
             sides_a.find_far(of_a, filter.widen(of_a.bound, gap, b));
             sides_b.find_far(of_b, filter.widen(of_b.bound, gap, a));
+            all &= ~(sides_a.far | sides_b.far);
+            all &= ~F::to_mask(filter.are_beyond_edge(a, b, gap) | filter.are_beyond_edge(b, a, gap));
+            keep_near(all & one_sided);
         }
-        const unsigned int one_sided = sides_a.one_sided | sides_b.one_sided, all = (1u << count) - 1;
         const unsigned int left = ~one_sided & all;
-        auto keep_near = [&](unsigned int which) { near_count += items.append(beside + near_count, which); };
-        if (gap >= 0.0f)
-            keep_near(all & one_sided & ~(sides_a.far | sides_b.far));
         const unsigned int planes_open = sides_a.uncertain | sides_b.uncertain;
         // For coincident or nearly coincident meshes, usually every pair is uncertain here.
         if ((left & ~planes_open) == 0) {

@@ -8,6 +8,7 @@
 struct PlaneFilter {
     typedef Float32 F;
     typedef F::lanes lanes;
+    typedef F::bits bits;
     typedef F::Point Point;
     // Of three points over a plane, and what they err by.
     struct Heights {
@@ -42,6 +43,24 @@ struct PlaneFilter {
         const lanes most = F::sum_sizes(normal), root = F::root(F::dot(normal, normal));
         const lanes length = (most > 0x1p-50f ? root : most) + 2.0f * (error * (p + q) + unit * (p * q));
         return (bound + gap * length) * (1.0f + 0x1p-18f);
+    }
+    // Whether the corners of B are farther than a gap from A along the normal of one of its edges in its plane, that
+    // which the first lies farthest beyond: docs/exactness.md, bound 25.
+    CUDA_CALLABLE bits are_beyond_edge(const Point (&a)[3], const Point (&b)[3], float gap) const {
+        const Point u = F::minus(a[1], a[0]), v = F::minus(a[2], a[0]), normal = F::cross(u, v);
+        const Point w0 = F::minus(b[0], a[0]), w1 = F::minus(b[1], a[0]), w2 = F::minus(b[2], a[0]);
+        const Point of_u = F::cross(u, normal), of_v = F::cross(normal, v);
+        const lanes over_u = F::dot(w0, of_u), over_v = F::dot(w0, of_v);
+        const lanes over_third = -(over_u + over_v) - F::dot(normal, normal);
+        const Point third = {-(of_u.x + of_v.x), -(of_u.y + of_v.y), -(of_u.z + of_v.z)};
+        const Point m = F::choose(over_third > F::most(over_u, over_v), third, F::choose(over_u > over_v, of_u, of_v));
+        const lanes lowest = F::least(F::dot(w0, m), F::least(F::dot(w1, m), F::dot(w2, m)));
+        const lanes highest = F::most(lanes{}, F::most(F::dot(u, m), F::dot(v, m)));
+        const lanes size = F::most(F::largest(F::sum_sizes(w0), F::sum_sizes(w1), F::sum_sizes(w2)),
+                                   F::most(F::sum_sizes(u), F::sum_sizes(v)));
+        const lanes sum = F::sum_sizes(m), length = sum > 0x1p-50f ? F::root(F::dot(m, m)) : sum;
+        const lanes wide = (gap * length + (error + 0x1p-20f * size) * sum) * (1.0f + 0x1p-18f);
+        return (lowest - highest > wide) & (sum > 0x1p-100f) & (size < 0x1p100f);
     }
     CUDA_CALLABLE lanes side_of_plane(const Point& a, const Point& b, const Point& c, const Point& d,
                                       lanes& bound) const {
@@ -106,7 +125,9 @@ inline CUDA_CALLABLE wp::int32 gap_signs(wp::float32 error, wp::float32 unit, wp
     const int signs = add_signs(add_signs(0, of_a), of_b);
     const int separated =
         one_sided(of_a, filter.widen(of_a.bound, gap, other)) | one_sided(of_b, filter.widen(of_b.bound, gap, of));
-    return separated < 0 ? -1 : signs;
+    const bool beyond =
+        Float32::first(filter.are_beyond_edge(of, other, gap)) | Float32::first(filter.are_beyond_edge(other, of, gap));
+    return separated < 0 || beyond ? -1 : signs;
 }
 
 // 1, -1, or UNCERTAIN; a bound of 0 makes 0 a sure sign.

@@ -305,7 +305,7 @@ class ManifoldQuery(Operator):
 
     def make_list_room(self, hits=None, uncertain=None):
         """Make room for longer lists; long ones serve parts of the pairs in turn. Waits for the device."""
-        needed = None if hits is None else hits + hits // 4, None if uncertain is None else more_room(uncertain)
+        needed = None if hits is None else hits + hits // 8, None if uncertain is None else more_room(uncertain)
         pairs = int(self.pair_count.numpy()[0])
         if self.parts is not None:
             self.guard.buffers.advance()
