@@ -130,7 +130,7 @@ def find_facing(
     """
 
 
-@wp.kernel(cuda_max_registers=128)
+@wp.kernel(cuda_max_registers=168)
 def find_near_witness_kernel(
     trees: Trees,
     batch: PairBatch,

@@ -57,10 +57,7 @@ template <class Number>
 struct Points64 : Number {
     typedef typename Number::lanes lanes;
     typedef typename Number::bits bits;
-    using Number::absolute;
-    using Number::divide;
-    using Number::fuse;
-    using Number::negate;
+    using Number::absolute, Number::divide, Number::fuse, Number::negate;
     struct Point {
         lanes x, y, z;
     };

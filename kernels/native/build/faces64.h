@@ -17,11 +17,7 @@ struct Faces64 : Points64<Number> {
     typedef typename F::lanes lanes;
     typedef typename F::bits bits;
     typedef typename F::Point Point;
-    using F::cross;
-    using F::dot;
-    using F::greater;
-    using F::lesser;
-    using F::minus;
+    using F::cross, F::dot, F::greater, F::lesser, F::minus;
     Point a, b, c, ab, ac, bc;
     lanes ab_sq, ac_sq, bc_sq, thin;
     // Outward normals of the edges ab, bc and ca in the face's plane, and which faces have an area; found when asked.

@@ -18,12 +18,7 @@ struct Crossings : Columns<Number> {
     typedef typename C::Point Point;
     typedef typename C::Faces Faces;
     typedef typename C::Measured Measured;
-    using C::choose;
-    using C::dot;
-    using C::greater;
-    using C::lesser;
-    using C::minus;
-    using C::negate;
+    using C::choose, C::dot, C::greater, C::lesser, C::minus, C::negate;
 
     // A contact of faces that cross, in A's frame.
     struct Crossing {

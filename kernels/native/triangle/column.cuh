@@ -18,12 +18,7 @@ struct Columns : Points64<Number> {
     typedef typename F::lanes lanes;
     typedef typename F::bits bits;
     typedef typename F::Point Point;
-    using F::choose;
-    using F::dot;
-    using F::greater;
-    using F::lesser;
-    using F::minus;
-    using F::negate;
+    using F::choose, F::dot, F::greater, F::lesser, F::minus, F::negate;
 
     // The faces of the pair's first object and of its second, A's frame.
     struct Faces {

@@ -9,11 +9,7 @@ struct WidestGap : Points64<Number> {
     typedef typename F::lanes lanes;
     typedef typename F::bits bits;
     typedef typename F::Point Point;
-    using F::dot;
-    using F::greater;
-    using F::lesser;
-    using F::minus;
-    using F::negate;
+    using F::dot, F::greater, F::lesser, F::minus, F::negate;
 
     // Corners as of `Triangles`, and the edges from each to the next.
     struct Scaled {
