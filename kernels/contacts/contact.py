@@ -31,6 +31,8 @@ SHORTEST_NORMAL = wp.constant(wp.float64(2.0**-20))
 class Contacts:
     """One entry an intersecting face pair, its objects in the order in which the pair names them, world frame."""
 
+    face: wp.array(dtype=wp.vec3i)  # (pair, face of its first object, face of its second), sorted; [0] of witnesses
+    start: wp.array(dtype=wp.int32)  # where those of each pair start, at last where all end, shape [pair + 1]; or [0]
     p0: wp.array(dtype=wp.vec3d)  # first end [world units]
     p1: wp.array(dtype=wp.vec3d)  # second end [world units]
     normal_a: wp.array(dtype=wp.vec3d)  # unit normal of the first object's face
@@ -79,6 +81,12 @@ def contact_objects(batch: PairBatch, p: wp.int32):
 
 
 @wp.func
+def count_contacts(contacts: Contacts):
+    """Return how many contacts of all pairs there are."""
+    return contacts.start[contacts.start.shape[0] - 1]
+
+
+@wp.func
 def have_crossed(contacts: Contacts, i: wp.int32):
     """Return whether a contact's faces intersect; with a gap they may be apart."""
     if contacts.separation.shape[0] == 0:
@@ -122,8 +130,6 @@ def find_contact_kernel(
     trees: Trees,
     batch: PairBatch,
     proven: bool,
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
     deferred_inout: Deferred,
     contacts_out: Contacts,
 ):
@@ -131,15 +137,15 @@ def find_contact_kernel(
 
     Args:
         proven: Whether face pairs are known to intersect, by exact signs.
-        start: Where the face pairs of each object pair start, shape [pair + 1]; after the last pair, where all end.
     """
     i = wp.tid()
-    if i >= start[start.shape[0] - 1] or not have_crossed(contacts_out, i):
+    if i >= count_contacts(contacts_out) or not have_crossed(contacts_out, i):
         return
-    p = faces[i][0]
+    row = contacts_out.face[i]
+    p = row[0]
     own = contact_objects(batch, p)
-    a = load_corner_ids(trees.states, batch.poses[p].corner_a + faces[i][1 + own.swapped])
-    b = load_corner_ids(trees.states, batch.poses[p].corner_b + faces[i][2 - own.swapped])
+    a = load_corner_ids(trees.states, batch.poses[p].corner_a + row[1 + own.swapped])
+    b = load_corner_ids(trees.states, batch.poses[p].corner_b + row[2 - own.swapped])
     a0, a1, a2, b0, b1, b2 = load_face_pair(trees.models, batch.poses[p], a, b)
     normal_a, normal_b, p0, p1 = wp.vec3d(), wp.vec3d(), wp.vec3d(), wp.vec3d()
     sure_a, sure_b = find_normal(a0, a1, a2, normal_a), find_normal(b0, b1, b2, normal_b)
@@ -156,7 +162,6 @@ def find_deferred_kernel(
     step: wp.int32,
     trees: Trees,
     batch: PairBatch,
-    faces: wp.array(dtype=wp.vec3i),
     deferred: Deferred,
     contacts_out: Contacts,
 ):
@@ -165,11 +170,11 @@ def find_deferred_kernel(
     k = at_once * (wp.tid() / warp_size()) + warp_lane()
     while warp_lane() < at_once and k < deferred.total[0]:
         i = deferred.place[k]
-        p = faces[i][0]
+        row = contacts_out.face[i]
+        p = row[0]
         own = contact_objects(batch, p)
         corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-        face_a, face_b = faces[i][1 + own.swapped], faces[i][2 - own.swapped]
-        load_corners(trees, batch.poses[p], face_a, face_b, corner)
+        load_corners(trees, batch.poses[p], row[1 + own.swapped], row[2 - own.swapped], corner)
         p0, p1, coplanar = intersect_faces(batch.poses[p].scale, corner)
         normal_a = face_normal(corner[0], corner[1], corner[2])
         normal_b = face_normal(corner[3], corner[4], corner[5])
@@ -187,7 +192,6 @@ def simd_contacts(
     position: wp.vec3d,
     proven: bool,
     span: wp.vec3i,
-    faces: wp.array(dtype=wp.vec3i),
     place: wp.array(dtype=wp.int32),
     contacts: Contacts,
 ) -> wp.int32:
@@ -207,14 +211,13 @@ def find_pair_contacts_kernel(
     trees: Trees,
     batch: PairBatch,
     proven: bool,
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
     deferred_inout: Deferred,
     contacts_out: Contacts,
 ):
     """Compute the contacts of one object pair, or defer them; one thread after the other, CPU only."""
     p = wp.tid()
     a = wp.min(batch.pairs[p][0], batch.pairs[p][1])
+    start = contacts_out.start
     if start[p] < start[p + 1]:
         deferred_inout.total[0] = simd_contacts(
             trees.models,
@@ -224,7 +227,6 @@ def find_pair_contacts_kernel(
             trees.objects.position[a],
             proven,
             wp.vec3i(start[p], start[p + 1], deferred_inout.total[0]),
-            faces,
             deferred_inout.place,
             contacts_out,
         )

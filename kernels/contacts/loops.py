@@ -11,7 +11,7 @@ from warp_abtree.kernels.base.arrays import LAST_KEY, Trees
 from warp_abtree.kernels.base.lanes import count_lanes, first_lane, warp_lane, warp_size
 from warp_abtree.kernels.base.poses import PairBatch
 from warp_abtree.kernels.base.sums import add_in_order, six_numbers
-from warp_abtree.kernels.contacts.contact import Contacts, pair_direction
+from warp_abtree.kernels.contacts.contact import Contacts, count_contacts, pair_direction
 from warp_abtree.kernels.contacts.manifold import Curves
 from warp_abtree.kernels.triangle.distance import largest_coordinate
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
@@ -71,25 +71,18 @@ def are_across(contacts: Contacts, normal: wp.array(dtype=wp.vec3d), i: wp.int32
 
 
 @wp.kernel
-def begin_loop_kernel(
-    width: wp.int32,
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    curves_out: Curves,
-    order_out: wp.array(dtype=wp.int32),
-    key_out: wp.array(dtype=wp.int64),
-):
+def begin_loop_kernel(width: wp.int32, contacts: Contacts, curves_out: Curves):
     """Make each contact a loop of its own, with a key that brings contacts of one face of B together.
 
     Args:
         width: Bits that a face takes in a key, below its pair.
     """
     i = wp.tid()
-    order_out[i] = i
-    key_out[i] = LAST_KEY
-    if i < start[start.shape[0] - 1]:
+    curves_out.order[i] = i
+    curves_out.key[i] = LAST_KEY
+    if i < count_contacts(contacts):
         curves_out.parent[i] = i
-        key_out[i] = (wp.int64(faces[i][0]) << wp.int64(width)) | wp.int64(faces[i][2])
+        curves_out.key[i] = (wp.int64(contacts.face[i][0]) << wp.int64(width)) | wp.int64(contacts.face[i][2])
 
 
 @native.func_native(cpu=True)
@@ -98,31 +91,18 @@ def sort_span(first: wp.int32, last: wp.int32, key: wp.array(dtype=wp.int64), or
 
 
 @wp.kernel
-def sort_loop_kernel(
-    start: wp.array(dtype=wp.int32), key_inout: wp.array(dtype=wp.int64), order_inout: wp.array(dtype=wp.int32)
-):
-    """Sort the contacts of one object pair by their keys, one thread after the other, CPU only.
-
-    Args:
-        key_inout: Keys, then scratch, shape [2 capacity].
-    """
-    p = wp.tid()
+def sort_loop_kernel(contacts: Contacts, curves_inout: Curves):
+    """Sort the contacts of one object pair by their keys, one thread after the other, CPU only."""
+    p, start = wp.tid(), contacts.start
     if start[p] < start[p + 1]:
-        sort_span(start[p], start[p + 1], key_inout, order_inout)
+        sort_span(start[p], start[p + 1], curves_inout.key, curves_inout.order)
 
 
 @wp.kernel
-def link_loop_kernel(
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    contacts: Contacts,
-    order: wp.array(dtype=wp.int32),
-    key: wp.array(dtype=wp.int64),
-    curves_inout: Curves,
-):
+def link_loop_kernel(contacts: Contacts, curves_inout: Curves):
     """Unite each contact with the next of its face that is not across a gap, for faces of either object."""
-    i = wp.tid()
-    last = start[start.shape[0] - 1]
+    i, last, faces = wp.tid(), count_contacts(contacts), contacts.face
+    order, key = curves_inout.order, curves_inout.key
     if i + 1 >= last:
         return
     j = i + 1
@@ -141,20 +121,15 @@ def link_loop_kernel(
 
 
 @wp.kernel
-def name_loop_kernel(
-    start: wp.array(dtype=wp.int32),
-    curves_inout: Curves,
-    order_out: wp.array(dtype=wp.int32),
-    key_out: wp.array(dtype=wp.int64),
-):
+def name_loop_kernel(contacts: Contacts, curves_inout: Curves):
     """Name the loop of each contact by its first, as the key that brings loops together."""
     i = wp.tid()
-    order_out[i] = i
-    key_out[i] = LAST_KEY
-    if i < start[start.shape[0] - 1]:
+    curves_inout.order[i] = i
+    curves_inout.key[i] = LAST_KEY
+    if i < count_contacts(contacts):
         root = find_root(curves_inout.parent, i)
         curves_inout.loop[i] = root
-        key_out[i] = wp.int64(root)
+        curves_inout.key[i] = wp.int64(root)
 
 
 @wp.struct
@@ -213,23 +188,14 @@ def sum_loop(
 
 
 @wp.kernel
-def average_loop_kernel(
-    trees: Trees,
-    batch: PairBatch,
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    contacts: Contacts,
-    order: wp.array(dtype=wp.int32),
-    curves_inout: Curves,
-):
+def average_loop_kernel(trees: Trees, batch: PairBatch, contacts: Contacts, curves_inout: Curves):
     """Find the normals of loops, by the warp of their first contact: the direction of the area within the curve.
 
     Moving an object by dx changes the volume that closed surfaces share by the vector area of the curve times dx, so
     this is the direction that frees them soonest. An open or empty curve, or one too short for its coordinates, takes
     the mean of its contacts' normals.
     """
-    last = start[start.shape[0] - 1]
-    k = wp.tid()
+    k, last, order, faces = wp.tid(), count_contacts(contacts), curves_inout.order, contacts.face
     begins = k < last
     if begins:
         begins = curves_inout.loop[order[k]] == order[k]

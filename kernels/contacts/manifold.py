@@ -6,7 +6,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ObjectPool, Trees
 from warp_abtree.kernels.base.poses import PairBatch, PairPose
 from warp_abtree.kernels.contacts.column import COLUMN_CORNERS, NO_DEPTH, FacePair, load_pair
-from warp_abtree.kernels.contacts.contact import Contacts
+from warp_abtree.kernels.contacts.contact import Contacts, count_contacts
 from warp_abtree.kernels.contacts.slots import Slots, WitnessRows, gap_of
 from warp_abtree.kernels.intersect.face_pairs import NEAR_BIT, Hits
 
@@ -27,6 +27,8 @@ class Curves:
     loop: wp.array(dtype=wp.int32)  # first contact of its loop, shape [contact]
     loop_normal: wp.array(dtype=wp.vec3d)  # at the first contact of each loop, shape [contact]
     has_area: wp.array(dtype=wp.int32)  # there, 1 where the normal is that of an area, else 0, shape [contact]
+    order: wp.array(dtype=wp.int32)  # contacts in the order of their keys, then scratch, shape [2 contact]
+    key: wp.array(dtype=wp.int64)  # of a face of B, later of a loop, then scratch, shape [2 contact]
 
 
 @wp.struct
@@ -92,8 +94,9 @@ def find_crossing(
 
 
 @wp.func
-def load_crossing(i: wp.int32, trees: Trees, batch: PairBatch, faces: wp.vec3i, contacts: Contacts):
+def load_crossing(i: wp.int32, trees: Trees, batch: PairBatch, contacts: Contacts):
     """Return the faces of contact i."""
+    faces = contacts.face[i]
     a = wp.min(batch.pairs[faces[0]][0], batch.pairs[faces[0]][1])
     return load_pair(trees, batch.poses[faces[0]], a, faces, contacts.normal_a[i], contacts.normal_b[i])
 
@@ -103,9 +106,6 @@ def offer_crossing_kernel(
     trees: Trees,
     batch: PairBatch,
     gap: wp.array(dtype=wp.float64),
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    order: wp.array(dtype=wp.int32),
     contacts: Contacts,
     curves: Curves,
     slots_inout: Slots,
@@ -114,13 +114,13 @@ def offer_crossing_kernel(
 
     Args:
         gap: Of pairs, as for `offer_crossing`, shape [pair]; [0] for none.
-        start, faces, order: Contacts of pairs, as for `loops`, in the order of loops.
+        curves: Contacts in the order of loops.
     """
-    if wp.tid() >= start[start.shape[0] - 1]:
+    if wp.tid() >= count_contacts(contacts):
         return
-    i = order[wp.tid()]
-    p, root = faces[i][0], curves.loop[i]
-    pair, has_area = load_crossing(i, trees, batch, faces[i], contacts), curves.has_area[root] != 0
+    i = curves.order[wp.tid()]
+    p, root = contacts.face[i][0], curves.loop[i]
+    pair, has_area = load_crossing(i, trees, batch, contacts), curves.has_area[root] != 0
     loop, shell = curves.loop_normal[root], gap_of(gap, p)
     offer_crossing(trees, batch.poses[p], pair, loop, has_area, shell, i, p, slots_inout)
     slots_inout.used[p] = 1
@@ -134,7 +134,6 @@ def simd_offer_crossing(
     gap: wp.float64,
     pair: wp.int32,
     span: wp.vec2i,
-    faces: wp.array(dtype=wp.vec3i),
     contacts: Contacts,
     curves: Curves,
     slots: Slots,
@@ -152,18 +151,16 @@ def offer_pair_crossing_kernel(
     trees: Trees,
     batch: PairBatch,
     gap: wp.array(dtype=wp.float64),
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
     contacts: Contacts,
     curves: Curves,
     slots_inout: Slots,
 ):
     """Offer the contacts of one object pair, as `offer_crossing_kernel`; one thread after the other, CPU only."""
-    p = wp.tid()
+    p, start = wp.tid(), contacts.start
     if start[p] < start[p + 1]:
         a, span = wp.min(batch.pairs[p][0], batch.pairs[p][1]), wp.vec2i(start[p], start[p + 1])
         shell = gap_of(gap, p)
-        simd_offer_crossing(trees, batch.poses[p], a, shell, p, span, faces, contacts, curves, slots_inout)
+        simd_offer_crossing(trees, batch.poses[p], a, shell, p, span, contacts, curves, slots_inout)
         slots_inout.used[p] = 1
 
 
@@ -172,7 +169,6 @@ def find_crossing_kernel(
     trees: Trees,
     batch: PairBatch,
     gap: wp.array(dtype=wp.float64),
-    faces: wp.array(dtype=wp.vec3i),
     contacts: Contacts,
     curves: Curves,
     hits: Hits,
@@ -195,7 +191,7 @@ def find_crossing_kernel(
     if item[0] < 0 or item[0] >= NEAR_BIT:
         return
     i, root = item[1], curves.loop[item[1]]
-    pair, has_area = load_crossing(i, trees, batch, faces[i], contacts), curves.has_area[root] != 0
+    pair, has_area = load_crossing(i, trees, batch, contacts), curves.has_area[root] != 0
     loop, shell = curves.loop_normal[root], gap_of(gap, item[0])
     if not find_crossing(trees.objects, pair, loop, has_area, shell, batch.poses[item[0]].scale, w, witnesses_out):
         # The middle and an end are candidates then, which have no depth.

@@ -16,6 +16,7 @@ from warp_abtree.kernels.contacts.contact import (
     Deferred,
     PairObjects,
     contact_objects,
+    count_contacts,
     have_crossed,
     pair_direction,
 )
@@ -69,42 +70,31 @@ def find_depth(t: Triangles, direction: wp.ref[wp.vec3d]) -> wp.float64:
 
 
 @wp.kernel
-def mark_near_kernel(
-    start: wp.array(dtype=wp.int32),
-    faces_inout: wp.array(dtype=wp.vec3i),
-    listed_inout: Deferred,
-    contacts_out: Contacts,
-):
+def mark_near_kernel(listed_inout: Deferred, contacts_inout: Contacts):
     """Take the marks of those that are apart from sorted face pairs, as signs of separations, and list these.
 
     The list goes from the end of its places on, since those that are deferred are listed from their start.
     """
     i = wp.tid()
     near = bool(False)
-    if i < start[start.shape[0] - 1]:
-        row = faces_inout[i]
+    if i < count_contacts(contacts_inout):
+        row = contacts_inout.face[i]
         near = (row[0] & NEAR_BIT) != 0
         row[0] = row[0] & PAIR_MASK
-        faces_inout[i] = row
-        contacts_out.separation[i] = wp.where(near, LEAST_SEPARATION, -LEAST_SEPARATION)
+        contacts_inout.face[i] = row
+        contacts_inout.separation[i] = wp.where(near, LEAST_SEPARATION, -LEAST_SEPARATION)
     slot = reserve_slot(listed_inout.total, near)
     if near:
         listed_inout.place[listed_inout.place.shape[0] - 1 - slot] = i
 
 
 @wp.kernel(cuda_max_registers=128)
-def find_separation_kernel(
-    trees: Trees,
-    batch: PairBatch,
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    contacts_inout: Contacts,
-):
+def find_separation_kernel(trees: Trees, batch: PairBatch, contacts_inout: Contacts):
     """Compute the separation of one face pair that intersects a thread."""
     i = wp.tid()
-    if i >= start[start.shape[0] - 1] or not have_crossed(contacts_inout, i):
+    if i >= count_contacts(contacts_inout) or not have_crossed(contacts_inout, i):
         return
-    row = faces[i]
+    row = contacts_inout.face[i]
     p = row[0]
     swapped = batch.poses[p].swapped
     t = load_triangles(trees, batch.poses[p], row[1 + swapped], row[2 - swapped])
@@ -148,7 +138,6 @@ def find_near_contact_kernel(
     step: wp.int32,
     trees: Trees,
     batch: PairBatch,
-    faces: wp.array(dtype=wp.vec3i),
     listed: Deferred,
     uncertain_only: bool,
     contacts_inout: Contacts,
@@ -162,7 +151,7 @@ def find_near_contact_kernel(
     while k < listed.total[0]:
         i = listed.place[listed.place.shape[0] - 1 - k]
         if not uncertain_only or contacts_inout.separation[i] == LEAST_SEPARATION:
-            p = faces[i][0]
-            own = contact_objects(batch, p)
-            write_near_contact(i, trees, own, batch.poses[p], faces[i], contacts_inout)
+            row = contacts_inout.face[i]
+            own = contact_objects(batch, row[0])
+            write_near_contact(i, trees, own, batch.poses[row[0]], row, contacts_inout)
         k += step

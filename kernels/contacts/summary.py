@@ -86,9 +86,9 @@ def sum_chunks(p: wp.int32, start: wp.array(dtype=wp.int32), numbers: wp.array(d
 
 
 @wp.kernel
-def sum_length_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_inout: ChunkSums):
+def sum_length_kernel(contacts: Contacts, sums_inout: ChunkSums):
     """Sum the lengths of the contacts of one chunk a warp."""
-    c = wp.tid() / warp_size()
+    c, start = wp.tid() / warp_size(), contacts.start
     if c >= first_chunk(start.shape[0] - 1, start):
         return
     span = sums_inout.span[c]
@@ -108,12 +108,12 @@ def sum_length_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_
 
 
 @wp.kernel
-def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_inout: ChunkSums):
+def sum_mean_kernel(contacts: Contacts, sums_inout: ChunkSums):
     """Sum one chunk's points, from the first end of its pair, and normals, weighted by their part of the pair's length.
 
     Where all lengths vanish all weights are the same.
     """
-    c = wp.tid() / warp_size()
+    c, start = wp.tid() / warp_size(), contacts.start
     if c >= first_chunk(start.shape[0] - 1, start):
         return
     span = sums_inout.span[c]
@@ -156,13 +156,12 @@ def mean_normal(trees: Trees, pair: wp.vec2i, sum: wp.vec3d):
 def average_contacts_kernel(
     trees: Trees,
     batch: PairBatch,
-    start: wp.array(dtype=wp.int32),
     contacts: Contacts,
     sums: ChunkSums,
     pair_contacts_out: PairContacts,
 ):
     """Find the mean point and normal of one object pair a warp."""
-    p = wp.tid() / warp_size()
+    p, start = wp.tid() / warp_size(), contacts.start
     lengths = sum_chunks(p, start, sums.lengths)
     if lengths[1] == wp.float64(0.0):
         if warp_lane() == 0:
@@ -193,16 +192,10 @@ def simd_sum_means(
 
 
 @wp.kernel
-def sum_pair_kernel(
-    trees: Trees,
-    batch: PairBatch,
-    start: wp.array(dtype=wp.int32),
-    contacts: Contacts,
-    pair_contacts_out: PairContacts,
-):
+def sum_pair_kernel(trees: Trees, batch: PairBatch, contacts: Contacts, pair_contacts_out: PairContacts):
     """Sum the contacts of one object pair a thread, as the kernels above do; CPU only."""
     p = wp.tid()
-    ends = wp.vec2i(start[p], start[p + 1])
+    ends = wp.vec2i(contacts.start[p], contacts.start[p + 1])
     total, number = wp.float64(0.0), wp.float64(0.0)
     simd_sum_lengths(contacts, ends, total, number)
     if number == wp.float64(0.0):

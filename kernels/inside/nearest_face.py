@@ -135,7 +135,7 @@ def point_distance(trees: Trees, pose: PairPose, solid: Solid, face: wp.int32, p
 def bound_face(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d):
     """Return how far a face lies from a point along the way to its middle, times the length of that; and its square.
 
-    The first is 0 where it lies on both sides. No point of the face is nearer (docs/exactness.md, bound 24).
+    The first is 0 where it lies on both sides. No point of the face is nearer (docs/exactness.md, bound 25).
     """
     u, v, w = a - point, b - point, c - point
     g = (u + v) + w

@@ -80,7 +80,6 @@ def contact_packer(real: type, with_gap: bool):
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def pack_contact_kernel(
         first: wp.int32,
-        faces: wp.array(dtype=wp.vec3i),
         contacts: Contacts,
         records_out: wp.array(dtype=wp.uint8),
     ):
@@ -88,7 +87,7 @@ def contact_packer(real: type, with_gap: bool):
         i, k = wp.tid()
         at = i * wp.static(13 + numbers * size)
         if k < 3:
-            store_bits(records_out, at + 4 * k, 4, wp.int64(faces[first + i][k]))
+            store_bits(records_out, at + 4 * k, 4, wp.int64(contacts.face[first + i][k]))
         elif k < wp.static(3 + numbers):
             x = load_component(contacts, first + i, k - 3)
             bits = wp.static(float64_bits if size == 8 else float32_bits)(x)
@@ -135,7 +134,6 @@ def contact_copier(real: type):
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def copy_contact_kernel(
-        faces: wp.array(dtype=wp.vec3i),
         contacts: Contacts,
         pair_out: wp.array(dtype=wp.int32),
         faces_out: wp.array(dtype=wp.vec2i),
@@ -148,8 +146,8 @@ def contact_copier(real: type):
     ):
         """Copy one contact a thread."""
         i = wp.tid()
-        pair_out[i] = faces[i][0]
-        faces_out[i] = wp.vec2i(faces[i][1], faces[i][2])
+        pair_out[i] = contacts.face[i][0]
+        faces_out[i] = wp.vec2i(contacts.face[i][1], contacts.face[i][2])
         p0_out[i] = wp.static(convert)(contacts.p0[i])
         p1_out[i] = wp.static(convert)(contacts.p1[i])
         normal_a_out[i] = wp.static(convert)(contacts.normal_a[i])

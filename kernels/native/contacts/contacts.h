@@ -99,8 +99,8 @@ struct ContactFinder {
 
 template <class ModelPool, class StatePool, class PairPose, class Contacts>
 wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const PairPose& pose, wp::mat33d rotation,
-                        wp::vec3d position, bool proven, wp::vec3i span, wp::array_t<wp::vec3i> faces,
-                        wp::array_t<wp::int32> place, const Contacts& contacts) {
+                        wp::vec3d position, bool proven, wp::vec3i span, wp::array_t<wp::int32> place,
+                        const Contacts& contacts) {
 #pragma clang fp contract(off)
     const bool with_gap = contacts.separation.shape[0] != 0;
     const ContactFinder<PairPose, Contacts> finder = {
@@ -108,7 +108,7 @@ wp::int32 simd_contacts(const ModelPool& models, const StatePool& states, const 
         contacts,
         rotation,
         position,
-        {pose, faces.data, (const double*)models.vertex_pos.data, states.face_corner.data},
+        {pose, contacts.face.data, (const double*)models.vertex_pos.data, states.face_corner.data},
         proven,
         with_gap,
         pose.swapped != 0,

@@ -6,10 +6,9 @@
 
 template <class Trees, class PairPose, class Contacts, class Curves, class Slots>
 void simd_offer_crossing(const Trees& trees, const PairPose& pose, wp::int32 a, wp::float64 gap, wp::int32 pair,
-                         wp::vec2i span, wp::array_t<wp::vec3i> faces, const Contacts& contacts, const Curves& curves,
-                         const Slots& slots) {
+                         wp::vec2i span, const Contacts& contacts, const Curves& curves, const Slots& slots) {
     typedef Crossings<Lanes64> C;
-    const ContactFaces<PairPose> corners = {pose, faces.data, (const double*)trees.models.vertex_pos.data,
+    const ContactFaces<PairPose> corners = {pose, contacts.face.data, (const double*)trees.models.vertex_pos.data,
                                             trees.states.face_corner.data};
     const SlotView view = view_pair(trees, pose, a, pair, slots);
     wp::int64* const own = slots.key.data + (wp::int64)pair * SLOT_ROOM;

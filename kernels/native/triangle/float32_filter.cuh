@@ -45,7 +45,7 @@ struct PlaneFilter {
         return (bound + gap * length) * (1.0f + 0x1p-18f);
     }
     // Whether the corners of B are farther than a gap from A along the normal of one of its edges in its plane, that
-    // which the first lies farthest beyond: docs/exactness.md, bound 25.
+    // which the first lies farthest beyond: docs/exactness.md, bound 24.
     CUDA_CALLABLE bits are_beyond_edge(const Point (&a)[3], const Point (&b)[3], float gap) const {
         const Point u = F::minus(a[1], a[0]), v = F::minus(a[2], a[0]), normal = F::cross(u, v);
         const Point w0 = F::minus(b[0], a[0]), w1 = F::minus(b[1], a[0]), w2 = F::minus(b[2], a[0]);

@@ -87,14 +87,12 @@ class ContactStage(Stage):
         sums: Whether summaries are made, and results have both; else what follows reduces the contacts.
 
     Attributes:
-        faces, contacts, pair_contacts, start: As of `ContactQuery`.
+        contacts, pair_contacts: As of `ContactQuery`.
         deferred: Contacts that float32 does not tell, `contact.Deferred`; a list that is scratch from then on.
         order, key: Scratch of the sort, which holds twice as many entries.
         dtype: Type of the real numbers of results.
     """
 
-    faces: wp.array
-    start: wp.array
     key: wp.array
     order: wp.array
     sort: HitSort
@@ -127,13 +125,12 @@ class ContactStage(Stage):
         if hits >= 2**30:
             raise CapacityError(f"{hits} face pairs asked, a contact query has room for fewer than 2^30")
         return [
-            Array(self, "faces", wp.vec3i, hits),
-            *fields(self.contacts, hits, **dict.fromkeys(VECTORS, wp.vec3d), coplanar=wp.int32),
+            *fields(self.contacts, hits, face=wp.vec3i, **dict.fromkeys(VECTORS, wp.vec3d), coplanar=wp.int32),
             Array(self.deferred, "place", wp.int32, hits),
             # The sort takes as much again as scratch.
             Array(self, "key", wp.int64, 2 * hits),
             Array(self, "order", wp.int32, 2 * hits),
-            Array(self, "start", wp.int32, pairs + 1, 0),
+            Array(self.contacts, "start", wp.int32, pairs + 1, 0),
             *fields(self.pair_contacts, pairs, point=wp.vec3d, normal=wp.vec3d),
             *([Array(self.contacts, "separation", wp.float64, hits)] if self._with_gap else []),
             *fields(self._sums, self._chunk_count(hits, pairs), span=wp.vec3i, lengths=six_numbers, means=six_numbers),
@@ -142,7 +139,7 @@ class ContactStage(Stage):
     def link(self):
         """Let both lists of contacts share their array, and give the operator what users read."""
         self._near.place = self.deferred.place
-        self.operator.faces, self.operator.start = self.faces, self.start
+        self.operator.faces, self.operator.start = self.contacts.face, self.contacts.start
 
     @staticmethod
     def _chunk_count(places: int, pairs: int) -> int:
@@ -163,26 +160,25 @@ class ContactStage(Stage):
             self._reduce(count)
 
     def _sort(self, count: int):
-        operator, hits = self.operator, self.operator.hits
+        operator, hits, found = self.operator, self.operator.hits, self.contacts
         if not operator.uses_warps():
-            inputs = [count, hits.total, hits.face, self.key, self.faces, self.start, self._listed_totals]
+            inputs = [count, hits.total, hits.face, self.key, found.face, found.start, self._listed_totals]
             operator.launch_kernel(sort_hits.sort_by_pair_kernel, 1, inputs, given=(count,))
             return
-        ends = self.start, self._listed_totals, self._sums.span
+        ends = found.start, self._listed_totals, self._sums.span
         if count == 0:
-            self.start.zero_()
+            found.start.zero_()
             self._listed_totals.zero_()
-        if not self.sort.launch(count, self.order, self.key, self.faces, ends=ends):
-            inputs = [self.start, self._sums.span]
+        if not self.sort.launch(count, self.order, self.key, found.face, ends=ends):
+            inputs = [found.start, self._sums.span]
             operator.launch_kernel(summary.locate_chunk_kernel, self._chunk_count(count, operator.rooms.pairs), inputs)
 
     def _find(self, count: int):
         operator, launch, contacts = self.operator, self.operator.launch_kernel, self.contacts
         posed, warps = [operator.batch.trees, operator.pair_batch], operator.uses_warps()
-        inputs = [*posed, self._proven, self.start, self.faces, self.deferred, contacts]
+        inputs = [*posed, self._proven, self.deferred, contacts]
         if self._with_gap:
-            marked = [self.start, self.faces, self._near, contacts]
-            launch(separation.mark_near_kernel, -(-count // WARP_SIZE) * WARP_SIZE, marked)
+            launch(separation.mark_near_kernel, -(-count // WARP_SIZE) * WARP_SIZE, [self._near, contacts])
         if warps:
             launch(contact.find_contact_kernel, count, inputs, WARP_SIZE)
         else:
@@ -190,23 +186,22 @@ class ContactStage(Stage):
         processors = operator.device.sm_count * WARP_SIZE if operator.device.is_cuda else 0
         if self._with_gap:
             if warps:
-                inputs = [*posed, self.start, self.faces, contacts]
-                launch(separation.find_separation_kernel, count, inputs, WARP_SIZE)
+                launch(separation.find_separation_kernel, count, [*posed, contacts], WARP_SIZE)
             step = LISTED_WARPS * processors or 1
-            inputs = [step, *posed, self.faces, self._near, not warps, contacts]
+            inputs = [step, *posed, self._near, not warps, contacts]
             launch(separation.find_near_contact_kernel, step, inputs, WARP_SIZE)
         step = DEFERRED_WARPS * processors or 1
-        launch(contact.find_deferred_kernel, step, [step, *posed, self.faces, self.deferred, contacts], WARP_SIZE)
+        launch(contact.find_deferred_kernel, step, [step, *posed, self.deferred, contacts], WARP_SIZE)
 
     def _reduce(self, count: int):
         operator, room, means = self.operator, self.operator.rooms.pairs, self.pair_contacts
         count, sums = self._chunk_count(count, room), self._sums
-        given = [operator.batch.trees, operator.pair_batch, self.start, self.contacts]
+        given = [operator.batch.trees, operator.pair_batch, self.contacts]
         if not operator.uses_warps():
             operator.launch_kernel(summary.sum_pair_kernel, room, [*given, means])
             return
-        operator.launch_warps(summary.sum_length_kernel, count, [self.start, self.contacts, sums])
-        operator.launch_warps(summary.sum_mean_kernel, count, [self.start, self.contacts, sums])
+        operator.launch_warps(summary.sum_length_kernel, count, [self.contacts, sums])
+        operator.launch_warps(summary.sum_mean_kernel, count, [self.contacts, sums])
         operator.launch_warps(summary.average_contacts_kernel, room, [*given, sums, means])
 
     def read(self, found: Found, device: bool, with_rows: bool):
@@ -226,7 +221,7 @@ class ContactStage(Stage):
         pairs = len(found.pairs)
         face_type, pair_type = contact_dtypes(self.dtype, self._with_gap)
         found.contacts, found.pair_contacts = np.zeros(count, face_type), np.zeros(pairs, pair_type)
-        found.faces = self.faces.numpy()[:count].reshape(-1, 3).copy()
+        found.faces = self.contacts.face.numpy()[:count].reshape(-1, 3).copy()
         found.pair_contacts["count"] = found.count
         with np.errstate(over="ignore"):
             for name in ("point", "normal"):
@@ -247,10 +242,10 @@ class ContactStage(Stage):
             self._launch(pack.pair_packer(real), (some, pack.PAIR_NUMBERS), inputs)
 
         def pack_contacts(first, some, target):
-            inputs = [first, self.faces, self.contacts, target]
+            inputs = [first, self.contacts, target]
             self._launch(pack.contact_packer(real, with_gap), (some, pack.CONTACT_NUMBERS + with_gap), inputs)
 
-        found.faces, memory = staging.send_rows(memory, self.faces, count)
+        found.faces, memory = staging.send_rows(memory, self.contacts.face, count)
         found.pair_contacts, memory = staging.send_records(memory, pair_type, pairs, pack_pairs)
         found.contacts, _ = staging.send_records(memory, face_type, count, pack_contacts)
         staging.wait()
@@ -262,13 +257,13 @@ class ContactStage(Stage):
         types = {"pair": wp.int32, "faces": wp.vec2i, **dict.fromkeys(VECTORS, vector), "coplanar": wp.bool}
         found.contacts = {name: self._empty(count, dtype) for name, dtype in types.items()}
         means = {"point": self._empty(pairs, vector), "normal": self._empty(pairs, vector)}
-        self._launch(pack.contact_copier(real), count, [self.faces, self.contacts, *found.contacts.values()])
+        self._launch(pack.contact_copier(real), count, [self.contacts, *found.contacts.values()])
         if self._with_gap:
             separation = found.contacts["separation"] = self._empty(count, real)
             self._launch(pack.number_copier(real), count, [self.contacts.separation, separation])
         self._launch(pack.summary_copier(real), pairs, [self.pair_contacts, *means.values()])
         found.pair_contacts = {"count": found.count, **means}
-        found.faces = wp.clone(first_rows(self.faces, count))
+        found.faces = wp.clone(first_rows(self.contacts.face, count))
 
     def _empty(self, count, dtype):
         return wp.empty(count, dtype=dtype, device=self.operator.device)

@@ -134,6 +134,10 @@ class PointStage(Stage):
             *fields(self.manifolds, (rooms.pairs, self.point_max), **self._fields, **self._kept),
         ]
 
+    def link(self):
+        """Let the sort of loops have the scratch of that of hits."""
+        self.curves.order, self.curves.key = self._contacts.order, self._contacts.key
+
     def search(self):
         """Take what is known of pairs that rest. Launches only."""
         if self._memory is not None:
@@ -148,7 +152,7 @@ class PointStage(Stage):
         self._slots.list_witnesses()
         room, found = self._slots.room(operator.rooms), [operator.hits, self._slots.rows]
         some = room if count is None else min(room, count)
-        inputs = [*posed, self._contacts.faces, contacts, self.curves, *found, self.witnesses]
+        inputs = [*posed, contacts, self.curves, *found, self.witnesses]
         launch(manifold.find_crossing_kernel, some, inputs, WARP_SIZE)
         if self._with_gap:
             launch(near_points.find_near_witness_kernel, some, [*posed, *found, self.near, self.witnesses], WARP_SIZE)
@@ -156,28 +160,25 @@ class PointStage(Stage):
             launch(nearest_contacts.keep_nearest_kernel, 2 * some, inputs, WARP_SIZE)
         self._choose_points([operator.batch.objects.pool, operator.pair_batch, self._twists, gap])
         if self._originals is not None:
-            self._originals.project(gap, self._contacts.faces, self._slots.rows, self.manifolds)
+            self._originals.project(gap, contacts.face, self._slots.rows, self.manifolds)
         self._add_inside_points()
         if self._memory is not None:
             self._memory.keep(self.manifolds)
 
     def _offer_crossing(self, count: int, posed):
         """Find the loops of what crosses, and offer its candidates to the slots. Launches only."""
-        of, operator, curves, launch = self._contacts, self.operator, self.curves, self.operator.launch_kernel
-        start, faces, contacts, sorted_by = of.start, of.faces, of.contacts, (of.order, of.key)
+        operator, launch, looped = self.operator, self.operator.launch_kernel, [self._contacts.contacts, self.curves]
         width = int(operator.batch.models.face_count.max()).bit_length()
-        launch(loops.begin_loop_kernel, count, [width, start, faces, curves, *sorted_by])
+        launch(loops.begin_loop_kernel, count, [width, *looped])
         self._sort_keys(count, width + operator.rooms.pairs.bit_length())
-        launch(loops.link_loop_kernel, count, [start, faces, contacts, *sorted_by, curves])
-        launch(loops.name_loop_kernel, count, [start, curves, *sorted_by])
+        launch(loops.link_loop_kernel, count, looped)
+        launch(loops.name_loop_kernel, count, looped)
         self._sort_keys(count, count.bit_length())
-        inputs = [*posed[:2], start, faces, contacts, of.order, curves]
-        launch(loops.average_loop_kernel, -(-count // WARP_SIZE) * WARP_SIZE, inputs, WARP_SIZE)
+        launch(loops.average_loop_kernel, -(-count // WARP_SIZE) * WARP_SIZE, [*posed[:2], *looped], WARP_SIZE)
+        inputs = [*posed, *looped, self._slots.slots]
         if operator.uses_warps():
-            inputs = [*posed, start, faces, of.order, contacts, curves, self._slots.slots]
             launch(manifold.offer_crossing_kernel, count, inputs)
         else:
-            inputs = [*posed, start, faces, contacts, curves, self._slots.slots]
             launch(manifold.offer_pair_crossing_kernel, operator.rooms.pairs, inputs)
 
     def _choose_points(self, given):
@@ -197,11 +198,11 @@ class PointStage(Stage):
 
     def _sort_keys(self, count, bits):
         """Sort contacts by their keys, of so many bits: those of pairs follow one another already. Launches only."""
-        operator, of = self.operator, self._contacts
+        operator, curves = self.operator, self.curves
         if operator.uses_warps():
-            radix_sort(of.key, of.order, count, bits)
+            radix_sort(curves.key, curves.order, count, bits)
         else:
-            operator.launch_kernel(loops.sort_loop_kernel, operator.rooms.pairs, [of.start, of.key, of.order])
+            operator.launch_kernel(loops.sort_loop_kernel, operator.rooms.pairs, [self._contacts.contacts, curves])
 
     def read(self, found: Found, device: bool, with_rows: bool):
         """Read the points."""
