@@ -21,13 +21,14 @@ SPACING = 1.6  # between neighbours on a cubic grid; a knot is about 2 long and 
 def drive_kernel(
     levels: wp.array(dtype=wp.int32),
     start: wp.array2d(dtype=wp.float64),
-    time: wp.array(dtype=wp.int32),
+    frame_inout: wp.array(dtype=wp.int32),
     lods_out: wp.array(dtype=wp.int32),
     poses_out: wp.array2d(dtype=wp.float64),
 ):
     """Move each object to and fro, and its LOD up and down the levels, by one every second frame on average."""
     i = wp.tid()
-    phase = (time[0] + 37 * i) % (4 * levels.shape[0])
+    frame_inout[i] = frame_inout[i] + 1
+    phase = (frame_inout[i] + 37 * i) % (4 * levels.shape[0])
     level = phase / 2
     if level >= levels.shape[0]:
         level = 2 * levels.shape[0] - 1 - level
@@ -37,13 +38,8 @@ def drive_kernel(
     poses_out[i, i % 3] = start[i, i % 3] + wp.float64(0.2) * wp.sin(wp.float64(0.05) * wp.float64(phase))
 
 
-@wp.kernel
-def count_frame_kernel(time_inout: wp.array(dtype=wp.int32)):
-    time_inout[0] = time_inout[0] + 1
-
-
 class Frames:
-    """A captured frame and the kernels that drive it, one graph; and the same frames from the host.
+    """A captured frame and the kernel that drives it, one graph; and the same frames from the host.
 
     Those take poses and LODs on the host to `set_poses`, `set_lods` and `intersect`.
     """
@@ -52,14 +48,13 @@ class Frames:
         self.scene, self.device, self.moves, self.turn = scene, scene.device, [], 0
         room = ab.Buffers(pairs=16 * scene.object_count)
         self.frame = ab.Pipeline(scene, "count", capacity=room, ladder=[levels] if ladder else None)
-        self.time = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self.frames = wp.zeros(len(self.frame.poses), dtype=wp.int32, device=self.device)  # driven, of each object
         start, levels = wp.clone(self.frame.poses), wp.array(levels, dtype=wp.int32, device=self.device)
-        self.inputs = [levels, start, self.time, self.frame.lods, self.frame.poses]
+        self.inputs = [levels, start, self.frames, self.frame.lods, self.frame.poses]
         self.launch()
         self.replay = make_replay(self.launch, self.device)
 
     def launch(self):
-        wp.launch(count_frame_kernel, 1, [self.time], device=self.device)
         wp.launch(drive_kernel, len(self.frame.poses), self.inputs, device=self.device)
         self.frame.launch()
 
@@ -77,7 +72,7 @@ class Frames:
     def check(self, count):
         """Run some frames both ways and compare their answers; return columns of the last one."""
         frame = self.frame
-        self.time.zero_()
+        self.frames.zero_()
         for _ in range(count):
             result = self.replay_and_read()
             frame.check()
