@@ -117,6 +117,7 @@ class PointStage(Stage):
         super().attach(operator)
         self._twists = wp.array(make_twists(), dtype=wp.float32, device=operator.device)
         self._no_gap = wp.empty(0, dtype=wp.float64, device=operator.device)
+        self._face_bits = int(operator.batch.models.face_count.max()).bit_length()
 
     def arrays(self, rooms: Rooms) -> list[Array]:
         """Return what has an entry a contact, a witness or a pair."""
@@ -168,9 +169,8 @@ class PointStage(Stage):
     def _offer_crossing(self, count: int, posed):
         """Find the loops of what crosses, and offer its candidates to the slots. Launches only."""
         operator, launch, looped = self.operator, self.operator.launch_kernel, [self._contacts.contacts, self.curves]
-        width = int(operator.batch.models.face_count.max()).bit_length()
-        launch(loops.begin_loop_kernel, count, [width, *looped])
-        self._sort_keys(count, width + operator.rooms.pairs.bit_length())
+        launch(loops.begin_loop_kernel, count, [self._face_bits, *looped])
+        self._sort_keys(count, self._face_bits + operator.rooms.pairs.bit_length())
         launch(loops.link_loop_kernel, count, looped)
         launch(loops.name_loop_kernel, count, looped)
         self._sort_keys(count, count.bit_length())
