@@ -281,6 +281,15 @@ def test_huge_gaps_reach_everything(device, regime):
         assert len(scene.intersect([(0, 1)], output="contacts", gap=gap).contacts) == 12 * 80
 
 
+@pytest.mark.parametrize("far", [1e17, 1e18, 1e19, 1e22, 1e25, 1e30])
+def test_objects_nearer_than_a_huge_gap_have_all_their_faces(device, regime, far):
+    """About 2^60 of their sizes apart, where float32 cuts gaps off, and farther."""
+    for size, axis in itertools.product((1e-10, 1.0), range(3)):
+        part = model_of(trimesh.creation.box((size,) * 3))
+        scene = scene_with(device, part, (part, (*(far * size * np.eye(3)[axis]), 0, 0, 0, 1)))
+        assert len(scene.intersect([(0, 1)], output="contacts", gap=1.1 * far * size).contacts) == 12 * 12
+
+
 @pytest.mark.parametrize("gap", [1e-3, 3e-5])
 def test_faces_a_little_nearer_than_a_gap_are_found(device, regime, gap):
     """By less than float32 tells, far from the middle of a large object: none is lost."""

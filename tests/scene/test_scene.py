@@ -290,6 +290,9 @@ def test_a_question_that_repeats_the_last_one_is_answered_anew(device):
         with pytest.raises(ValueError):
             scene.intersect(bad, output)
         assert scene.intersect(pairs).any.all()
+    for other in (1, 2):
+        masked = np.ma.array([(0, other)], mask=True)  # both have the bytes of what fills them
+        assert scene.intersect(masked).any.tolist() == [other == 1]
     scene.remove(1)
     with pytest.raises(ValueError, match="removed"):
         scene.intersect(pairs)

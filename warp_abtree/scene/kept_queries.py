@@ -60,7 +60,7 @@ class KeptQueries:
     def find(self, pairs, output, precision, contact_dtype, options: dict, device: bool) -> Result:
         """Answer `Scene.intersect`; a question without options that repeats the last one is not checked again."""
         question: tuple = ()
-        if isinstance(pairs, np.ndarray) and all(value is None for value in options.values()):
+        if type(pairs) is np.ndarray and all(value is None for value in options.values()):
             if isinstance(output, str) and isinstance(precision, str):
                 question = output, precision, pairs.dtype, pairs.shape, pairs.tobytes()
         last, key = self._last

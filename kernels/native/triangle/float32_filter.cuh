@@ -60,7 +60,7 @@ struct PlaneFilter {
                                    F::most(F::sum_sizes(u), F::sum_sizes(v)));
         const lanes sum = F::sum_sizes(m), length = sum > 0x1p-50f ? F::root(F::dot(m, m)) : sum;
         const lanes wide = (gap * length + (error + 0x1p-20f * size) * sum) * (1.0f + 0x1p-18f);
-        return (lowest - highest > wide) & (sum > 0x1p-100f) & (size < 0x1p100f);
+        return (lowest - highest > wide) & (sum > 0x1p-100f) & (size < 0x1p60f);
     }
     CUDA_CALLABLE lanes side_of_plane(const Point& a, const Point& b, const Point& c, const Point& d,
                                       lanes& bound) const {
