@@ -104,8 +104,12 @@ def compare_digests(trees, regimes):
 
 def compare_times(trees, rounds):
     """Yield a row a launch: medians [ms] and their ratio; return the ratios."""
-    ratios = []
-    for name in trees["now"].ask("list")["times"]:
+    ratios, listed = [], {key: tree.ask("list")["times"] for key, tree in trees.items()}
+    for name in listed["now"]:
+        lacking = [key for key, names in listed.items() if name not in names]
+        if lacking:
+            yield {"case": "time", "launch": name, "skipped": f"the tree {lacking[0]} has none, or not its meshes"}
+            continue
         for tree in trees.values():
             tree.ask("prepare", name=name)
             tree.ask("time", name=name, repeats=REPEATS)
