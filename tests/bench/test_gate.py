@@ -45,6 +45,10 @@ def test_differences_are_rows():
     assert differing == 3 and [row["answer"] for row in rows] == ["y", "gone", "new"]
     rows, ratios = end_of(compare.compare_times(trees, 2))
     assert ratios == [1.5] and (rows[0]["before_ms"], rows[0]["now_ms"]) == (2.0, 3.0)
+    now.answers["list"]["times"] = ["b", "a"]
+    rows, ratios = end_of(compare.compare_times(trees, 2))
+    assert ratios == [1.5] and "before has none" in rows[0]["skipped"] and rows[0]["launch"] == "b"
+    now.answers["list"]["times"] = ["a"]
     rows, _ = end_of(compare.compare_kernels(trees))
     assert [row["kernel"] for row in rows] == ["k 32", "new 32"]
 
