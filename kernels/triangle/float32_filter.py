@@ -32,7 +32,7 @@ def plane_signs(error: wp.float32, unit: wp.float32, a: wp.mat33, b: wp.mat33) -
 
 @native.func_native()
 def gap_signs(error: wp.float32, unit: wp.float32, gap: wp.float32, a: wp.mat33, b: wp.mat33) -> wp.int32:
-    """Return what `plane_signs` does, SEPARATED only where more than a gap lies between a triangle and a plane."""
+    """Return what `plane_signs` does, SEPARATED only where a face lies farther than a gap from a plane or an edge."""
 
 
 @wp.func

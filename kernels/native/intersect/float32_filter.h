@@ -1,5 +1,5 @@
 // The float32 filter of the CPU: 16 face pairs at a time, as `float32_filter_triangles` one by one. With a gap, 0 or
-// more, it also lists those that are apart, but not by more than the gap along the normal of a plane.
+// more, it also lists those that are apart, but not by more than the gap along the normal of a plane or of an edge.
 #pragma once
 #include "builtin.h"
 #include "intersect/sides.h"
