@@ -186,6 +186,7 @@ class Operator(DeviceMemory):
         """Put new arrays, (owner, attribute, array), in the place of old ones."""
         self.guard.buffers.advance()
         with self.changing():
+            self.commands = Commands()  # those recorded would keep the old ones
             for owner, name, array in made:
                 setattr(owner, name, array)
             has_other_pairs, self.rooms = rooms.pairs != self.rooms.pairs, rooms
