@@ -4,8 +4,13 @@ A row for all faces and for each tolerance of the LODs. Penetration [um] is how 
 one of its points stops a motion, over twists of all poses: mean, 95th percentile and largest, and mean and 95th
 percentile of the worst pose. The second object moves along a twist until a point blocks, at most twice the gap. To
 first order, and without friction: a contact at p with normal n comes apart at the rate n . (v + w x (p - c)). All near
-faces, as points, allow none. Times are of a launch over `--count` worlds at once, a nut and a bolt each; and of one
-world alone, on the CPU the time of the thread on one core, in turn with the face pairs of that world.
+faces, as points, allow none, but stop what is free: two faces side by side of one another come apart along a direction
+in which neither looks. So a second measure is of the meshes themselves. The object moves along a twist until a point
+blocks, at most the gap, beyond which near faces know nothing (moved_um; all_moved_um where all near faces block).
+really_um is how deep vertices of either mesh then lie inside the other one, beyond what they did at the start.
+
+Times are of a launch over `--count` worlds at once, a nut and a bolt each; and of one world alone, on the CPU the time
+of the thread on one core, in turn with the face pairs of that world.
 """
 
 import time
@@ -20,8 +25,8 @@ from ..meshes import NUT, ModelFolder
 from ..shapes import random_directions, scene_of_poses
 from ..timing import medians, one_core, ratio_of, time_in_turn
 
-FULL = {"poses": 8, "worlds": {"cuda": 1024, "cpu": 8}, "repeats": 5}
-QUICK = {"poses": 2, "worlds": {"cuda": 2, "cpu": 2}, "repeats": 1}
+FULL = {"poses": 8, "worlds": {"cuda": 1024, "cpu": 8}, "repeats": 5, "pushes": 100}
+QUICK = {"poses": 2, "worlds": {"cuda": 2, "cpu": 2}, "repeats": 1, "pushes": 6}
 LODS = {"all faces": None, "10 um": 1e-5, "30 um": 3e-5}  # tolerance [m]
 GAP = 1e-4  # of the pair [m]
 ASKED = (16, 32)
@@ -35,8 +40,8 @@ def run(device, quick=False, count=None, models=None):
     """Yield a row a LOD and number of points asked for.
 
     Columns: near is how many contacts a pose has within the gap, points how many of them were chosen; allowed_um and
-    the like are penetration; worlds_ms is a launch over all worlds, one_ms over the first, faces_ms is
-    `Query(scene, "faces")` of it and one_ratio one_ms over that.
+    the like are penetration, moved_um to really_worst_pose_um that of the meshes themselves; worlds_ms is a launch over
+    all worlds, one_ms over the first, faces_ms is `Query(scene, "faces")` of it and one_ratio one_ms over that.
     """
     sizes, folder = QUICK if quick else FULL, ModelFolder(models)
     missing = [name for name in NUT if not folder.has(name)]
@@ -57,6 +62,7 @@ def run(device, quick=False, count=None, models=None):
             row = {"case": name, "faces": faces, "poses": len(judged)}
             found = ab.ManifoldQuery(scene, pairs, gap=GAP, points=asked).run()
             row |= judge(near, found) | {"asked": asked, "worlds": count}
+            row |= push(parts, lods, judged, near, found, sizes["pushes"])
             yield row | time_worlds(device, parts, lods, placed, asked, found, sizes["repeats"])
 
 
@@ -85,12 +91,17 @@ def wrenches(contacts: Contacts, centre):
     return np.concatenate([contacts.normal, np.cross(contacts.point - centre, contacts.normal)], 1)
 
 
+def blocked_at(twists, centre, points: Contacts, most):
+    """Return how far each twist goes until a point blocks, at most so far."""
+    approach = -(twists @ wrenches(points, centre).T)
+    room = np.where(approach > SLOWEST, np.maximum(points.separation, 0), np.inf)
+    return (room / np.maximum(approach, SLOWEST)).min(1, initial=most)
+
+
 def penetration_allowed(contacts: Contacts, points: Contacts, gap, count=TWISTS):
     """Return how much deeper than at the start the near faces get along each twist [m], (count,)."""
     twists, centre = random_twists(contacts, count)
-    approach = -(twists @ wrenches(points, centre).T)
-    room = np.where(approach > SLOWEST, np.maximum(points.separation, 0), np.inf)
-    moved = twists * (room / np.maximum(approach, SLOWEST)).min(1, initial=2 * gap)[:, None]  # until a point blocks
+    moved = twists * blocked_at(twists, centre, points, 2 * gap)[:, None]
     across, at_start = wrenches(contacts, centre).T, max(0.0, -contacts.separation.min())
     parts = np.split(moved, range(CHUNK, count, CHUNK))
     least = np.concatenate([(part @ across + contacts.separation).min(1) for part in parts])
@@ -103,20 +114,102 @@ def points_of(found, p) -> Contacts:
     return Contacts(found.points["point"][own], found.points["normal"][own], -found.points["depth"][own])
 
 
+def contacts_of(near, p) -> Contacts:
+    """Return all near faces of a pair as contacts, at the middle of their nearest points."""
+    rows = near.contacts[near.contacts["pair"] == p]
+    return Contacts((rows["p0"] + rows["p1"]) / 2, rows["normal"], rows["separation"])
+
+
 def judge(near, found) -> dict:
     """Return the columns of penetration [um]; raise a RuntimeError where contacts and points are of other faces."""
     if not np.array_equal(near.any, found.any):
         raise RuntimeError("contacts and contact points differ about what intersects")
     allowed = []
     for p in range(len(near.pairs)):
-        rows = near.contacts[near.contacts["pair"] == p]
-        contacts = Contacts((rows["p0"] + rows["p1"]) / 2, rows["normal"], rows["separation"])
-        allowed.append(1e6 * penetration_allowed(contacts, points_of(found, p), GAP))
+        allowed.append(1e6 * penetration_allowed(contacts_of(near, p), points_of(found, p), GAP))
     allowed = np.array(allowed)
     means, tails = allowed.mean(1), np.percentile(allowed, 95, axis=1)
     row = {"near": near.count.mean(), "meet": near.any.sum(), "points": len(found.points["pair"]) / len(near.pairs)}
     row |= {"allowed_um": allowed.mean(), "allowed_p95_um": np.percentile(allowed, 95), "allowed_max_um": allowed.max()}
     return row | {"worst_pose_um": means.max(), "worst_pose_p95_um": tails.max()}
+
+
+def moved_along(twist, centre):
+    """Return the rigid motion of a twist, its velocity that of the centre, (4, 4)."""
+    angle = np.linalg.norm(twist[3:])
+    x, y, z = twist[3:] / (angle or 1.0)
+    cross, motion = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.eye(4)
+    motion[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    motion[:3, 3] = centre + twist[:3] - motion[:3, :3] @ centre
+    return motion
+
+
+class Side(NamedTuple):
+    """A mesh at a LOD, which points lie inside, and the vertices of the other one that are near it."""
+
+    model: ab.Model
+    lod: int
+    normals: np.ndarray  # by face of the file, (f, 3)
+    vertices: np.ndarray  # (k, 3), at the start in its own frame
+
+    def heights(self, points):
+        """Return the distances of points, (n,), and how far they lie in front of their nearest faces; infinite beyond
+        three gaps."""
+        found = ab.signed_distance(self.model, points, self.lod, signed=False, nearest=True, within=3 * GAP)
+        distance, nearest, face = found
+        ahead = np.einsum("ij,ij->i", points - nearest, self.normals[face])
+        return distance, np.where(face < 0, np.inf, ahead)
+
+    def depths(self, motions):
+        """Return how far the deepest vertex lies behind its nearest face after each motion of them [m].
+
+        Off an edge that may be said of a point outside. None can be deeper than it has moved beyond its distance at the
+        start.
+        """
+        distance, height = self.heights(self.vertices)
+        outside = height > -GAP / 10
+        vertices, room = self.vertices[outside], np.copysign(distance, height)[outside]
+        found = []
+        for motion in motions:
+            points = vertices @ motion[:3, :3].T + motion[:3, 3]
+            depth = -self.heights(points)[1]
+            deepest = np.linalg.norm(points - vertices, axis=1) - room
+            found.append(np.where(depth > deepest, 0.0, depth).max(initial=0.0))
+        return np.array(found) - max(0.0, -height[outside].min(initial=0.0))
+
+
+def sides(parts, lods, pose):
+    """Return the sides of the first mesh, and of the second one, which has a pose in the first's frame."""
+    meshes = [part.mesh_at(lod) for part, lod in zip(parts, lods)]
+    for k, matrix in enumerate((pose, np.linalg.inv(pose))):
+        vertices, faces, face_ids = meshes[k]
+        a, b, c = (vertices[faces[:, i]] for i in range(3))
+        normals = np.zeros((face_ids.max() + 1, 3))
+        normals[face_ids] = np.cross(b - a, c - a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+        own = meshes[1 - k][0] @ matrix[:3, :3].T + matrix[:3, 3]
+        near = np.isfinite(ab.signed_distance(parts[k], own, lods[k], signed=False, within=3 * GAP))
+        yield Side(parts[k], lods[k], normals, own[near])
+
+
+def push(parts, lods, poses, near, found, count) -> dict:
+    """Return columns of motions that points block, so many twists a pose, and of how deep the meshes are then [um]."""
+    ways, all_ways, depths = [], [], []
+    for p, pose in enumerate(poses):
+        contacts = contacts_of(near, p)
+        twists, centre = random_twists(contacts, count)
+        ways.append(blocked_at(twists, centre, points_of(found, p), GAP))
+        all_ways.append(blocked_at(twists, centre, contacts, GAP))
+        motions = [moved_along(way * twist, centre) for way, twist in zip(ways[-1], twists)]
+        first, second = sides(parts, lods, pose)
+        back = [np.linalg.inv(pose) @ np.linalg.inv(motion) @ pose for motion in motions]
+        scene, pairs = scene_of_poses("cpu", *parts, np.array(motions) @ pose)
+        scene.set_lods([lods[0]] + [lods[1]] * len(motions))
+        cross = scene.intersect(pairs, "any").any != 0  # else nothing is inside
+        depths.append(np.where(cross, np.maximum(first.depths(motions), second.depths(back)), 0.0))
+    row = {"moved_um": np.mean(ways), "all_moved_um": np.mean(all_ways), "really_um": np.mean(depths)}
+    row |= {"really_p95_um": np.percentile(depths, 95), "really_worst_pose_um": np.mean(depths, axis=1).max()}
+    return {key: 1e6 * value for key, value in row.items()}
 
 
 def time_worlds(device, models, lods, matrices, asked, found, repeats) -> dict:

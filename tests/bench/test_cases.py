@@ -181,6 +181,7 @@ def check_points(rows):
     for row in rows:
         assert 0 < row["points"] <= row["asked"] < row["near"] and row["poses"] == row["worlds"] == 2
         assert row["allowed_um"] <= row["worst_pose_um"] <= row["allowed_max_um"] <= 1e6 * 4 * points.GAP
+        assert 0 < row["moved_um"] < 1e6 * points.GAP and row["really_um"] <= row["really_worst_pose_um"] < 3
         assert row["one_ratio"] == pytest.approx(row["one_ms"] / row["faces_ms"], rel=0.02)
 
 

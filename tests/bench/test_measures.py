@@ -10,6 +10,7 @@ import warp_abtree as ab
 from bench import timing
 from bench.cases.update import bound_nodes
 from bench.contacts import points
+from bench.shapes import scene_of_poses
 from bench.studies.motions import Motions, find_first_contact
 from bench.studies.paper import update
 from bench.studies.tradeoff import regions, summaries, workload
@@ -143,6 +144,30 @@ def corners_at(separations):
     """Return contacts at the corners of a square of side 2 over a floor."""
     corners = np.array([(-1.0, -1, 0), (1, -1, 0), (-1, 1, 0), (1, 1, 0)])
     return points.Contacts(corners, np.tile([0, 0, 1.0], (4, 1)), np.array(separations))
+
+
+def test_depth_of_meshes_that_are_moved():
+    """A cube goes as deep into a larger one as it moves beyond the gap; where all points block, no deeper."""
+    boxes = [trimesh.creation.box((size, size, size)) for size in (2.0, 1.0)]
+    parts = [ab.Model.from_arrays(mesh.vertices, mesh.faces) for mesh in boxes]
+    (lods, start), height = ([part.lod_max for part in parts], 0.3 * points.GAP), 1.5
+    pose = np.eye(4)
+    pose[2, 3] = height + start
+    first, second = points.sides(parts, lods, pose)
+    assert len(first.vertices) == 4 and len(second.vertices) == 0  # no corner of the larger one is near
+    ways = points.GAP * np.array([0.1, 0.3, 0.7, 1.0])
+    down = [points.moved_along(np.array([0, 0, -way, 0, 0, 0]), np.zeros(3)) for way in ways]
+    np.testing.assert_allclose(first.depths(down), np.maximum(ways - start, 0), atol=1e-12)
+    tilted = points.moved_along(np.array([0, 0, 0, 1e-4, 0, 0]), np.array([0, 0, height + start - 0.5]))
+    np.testing.assert_allclose(tilted[:3, :3], [[1, 0, 0], [0, 1, -1e-4], [0, 1e-4, 1]], atol=1e-8)
+    np.testing.assert_allclose(first.depths([tilted]), 0.5e-4 - start, rtol=1e-3)
+    scene, pairs = scene_of_poses("cpu", *parts, [pose])
+    near = scene.intersect(pairs, "contacts", gap=points.GAP)
+    found = ab.ManifoldQuery(scene, pairs, gap=points.GAP, points=16).run()
+    row = points.push(parts, lods, [pose], near, found, 40)
+    assert row["really_um"] < 1e-3 and 0 < row["all_moved_um"] <= row["moved_um"] + 1e-9 < 1e6 * points.GAP
+    found.points["normal"][:] *= -1  # nothing blocks what goes down
+    assert points.push(parts, lods, [pose], near, found, 40)["really_um"] > 5
 
 
 def test_penetration_that_points_allow():
