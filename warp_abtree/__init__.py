@@ -7,14 +7,16 @@ from warp_abtree.checks.version import __version__ as __version__
 if TYPE_CHECKING:
     from warp_abtree.names import *  # noqa: F403
 else:
+    from warp_abtree.checks.lazy_names import find_modules, import_quickly
 
     def __getattr__(name):
-        """Import Warp and the library when the first of `warp_abtree.names` is asked for."""
+        """Import what one of `warp_abtree.names` stands for, and Warp with it, when it is first asked for."""
         if name == "__all__" or not name.startswith("_"):
-            import warp_abtree.names as public
-
-            globals().update({known: getattr(public, known) for known in ("__all__", *public.__all__)})
-            if name in globals():
+            source = "warp_abtree.names"
+            module = import_quickly(find_modules(source).get(name, source))
+            if hasattr(module, name):
+                globals()[name] = getattr(module, name)
+            if name in globals():  # packages, too
                 return globals()[name]
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

@@ -8,11 +8,15 @@ from threading import get_ident
 import warp as wp
 
 from warp_abtree.checks.cpu_threads import core_count, wait_for, workers
+from warp_abtree.checks.lazy_names import import_quickly
 
 # Threads beside the calling one: on the CPU each compiles Warp's headers for itself first.
 LOADING_THREADS = {"cpu": 1, "cuda": 7}
-# The same beside the build of a model, which keeps one core busy itself.
+# The same beside the build of a model, which keeps one core busy itself, and another while its kernels are loaded.
 AHEAD_THREADS = {"cpu": 2, "cuda": 6}
+
+# What registers the kernels of a first query, which may not have been imported yet.
+FIRST_QUERY = ("warp_abtree.scene.kept_queries",)
 
 _asked: set[tuple] = set()
 _first_query: list[Callable] = []
@@ -31,18 +35,17 @@ def _new_kernels(device, kernels) -> deque:
 
 
 @contextmanager
-def loading(device, kernels, busy: int = 0):
+def loading(device, kernels):
     """Load kernels beside what is done inside, and end when all are loaded; each is loaded once in a process.
 
     Raises what the compiler says, as a launch would.
 
     Args:
         kernels: The kernel and the block size of each launch, those first that take longest.
-        busy: Cores that other threads keep busy, as `compiling_ahead` says.
     """
     new = _new_kernels(device, kernels)
     total, done = len(new), []
-    threads = min(LOADING_THREADS["cpu" if device.is_cpu else "cuda"], core_count() - 1 - busy, len(new))
+    threads = min(LOADING_THREADS["cpu" if device.is_cpu else "cuda"], core_count() - 1, len(new))
 
     def load():
         while new:
@@ -65,7 +68,7 @@ def loading(device, kernels, busy: int = 0):
     try:
         tell(0)
         yield
-        if jobs or busy:
+        if jobs:
             load()
     finally:
         new.clear()
@@ -82,17 +85,19 @@ def of_first_query(function):
 
 
 @contextmanager
-def compiling_ahead(face_count: int):
-    """Compile beside what is done inside, the build of a model, what a query on Warp's default device will launch.
+def compiling_ahead(face_count: int, kernels):
+    """Load the kernels of a model's build, and compile beside what is done inside, the build, what a query on Warp's
+    default device will launch.
 
-    Yields the cores that this keeps busy. Only what has begun by the end is waited for, and the rest goes on meanwhile.
-    On a GPU nothing is loaded, so that a process which only builds models has no CUDA context. What the compiler says,
-    a launch will say again.
+    Only what has begun by the end is waited for, and the rest goes on meanwhile. On a GPU nothing is loaded, so that a
+    process which only builds models has no CUDA context. What the compiler says, a launch will say again.
+
+    Args:
+        kernels: Of the build, as `loading` takes them.
     """
-    device = wp.get_device()
+    device, cores = wp.get_device(), core_count()
     kind = "cpu" if device.is_cpu else "cuda"
-    new = deque(key for kernels in _first_query for key in _new_kernels(device, kernels(device, [face_count])))
-    threads = min(AHEAD_THREADS[kind], core_count() - 1, len(new))
+    new: deque = deque()
 
     def compile_next():
         with suppress(Exception):  # emptied at the end, or what the compiler says
@@ -102,10 +107,17 @@ def compiling_ahead(face_count: int):
             elif module.options["block_dim"] == block_dim:  # else a launch would look for another file
                 wp.compile_aot_module(module, device)
 
-    # The threads that `loading` takes later, each with Warp's headers compiled.
-    jobs = [workers(threads).submit(compile_next) for _ in range(len(new))] if threads > 0 else []
+    jobs: list = []
     try:
-        yield max(0, threads)
+        with loading(wp.get_device("cpu"), kernels):
+            if cores > 1:
+                for name in FIRST_QUERY:
+                    import_quickly(name)  # while another thread compiles
+                new.extend(key for found in _first_query for key in _new_kernels(device, found(device, [face_count])))
+                # The threads that `loading` takes later, each with Warp's headers compiled: with two cores the same.
+                threads = min(AHEAD_THREADS[kind], max(1, cores - 2), len(new))
+                jobs += [workers(threads).submit(compile_next) for _ in range(len(new))]
+        yield
         begun = [job for job in jobs if not job.cancel()]
         while new and not all(job.done() for job in begun):
             compile_next()

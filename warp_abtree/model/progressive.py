@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.checks.cpu_threads import core_count, wait_for
-from warp_abtree.checks.kernel_loading import compiling_ahead, loading
+from warp_abtree.checks.kernel_loading import compiling_ahead
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.build import active_build, vertex_forest
 from warp_abtree.kernels.build import collapse as collapse_kernels
@@ -159,9 +159,8 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None, cer
         raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
     report = progress if progress is not None else lambda stage, done, total: None
     kernels = [*ERROR_KERNELS, *KERNELS] if certify else KERNELS
-    with compiling_ahead(len(faces)) as busy:
-        with loading(wp.get_device("cpu"), kernels, busy):
-            collapse = Collapse(vertices, faces, int(base_faces))
+    with compiling_ahead(len(faces), kernels):
+        collapse = Collapse(vertices, faces, int(base_faces))
         merged, errors = _collapse(collapse, vertices, faces, report, then, certify)
         parent = collapse.parents()
         pos = np.concatenate([vertices, *merged])
