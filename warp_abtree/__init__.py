@@ -2,12 +2,12 @@
 
 from typing import TYPE_CHECKING
 
-from warp_abtree.checks.version import __version__ as __version__
+from warp_abtree.checks.package import __version__ as __version__
 
 if TYPE_CHECKING:
     from warp_abtree.names import *  # noqa: F403
 else:
-    from warp_abtree.checks.lazy_names import find_modules, import_quickly
+    from warp_abtree.checks.package import find_modules, import_quickly
 
     def __getattr__(name):
         """Import what one of `warp_abtree.names` stands for, and Warp with it, when it is first asked for."""

@@ -11,8 +11,8 @@ import sys
 
 def main() -> int:
     """Run the command line of this process and return its exit status."""
+    from warp_abtree.checks.package import __version__
     from warp_abtree.checks.signals import handle_signals
-    from warp_abtree.checks.version import __version__
 
     handle_signals(end_process, end_process)
     atexit.register(handle_signals, signal.SIG_IGN, signal.SIG_IGN)  # the last to be called: what is left is short

@@ -8,7 +8,7 @@ from threading import get_ident
 import warp as wp
 
 from warp_abtree.checks.cpu_threads import core_count, wait_for, workers
-from warp_abtree.checks.lazy_names import import_quickly
+from warp_abtree.checks.package import import_quickly
 
 # Threads beside the calling one: on the CPU each compiles Warp's headers for itself first.
 LOADING_THREADS = {"cpu": 1, "cuda": 7}

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.checks.atomic_write import atomic_write, sweep_up
-from warp_abtree.checks.version import __version__
+from warp_abtree.checks.package import __version__
 from warp_abtree.model.files.read import split_file_name
 
 VARIABLE = "WARP_ABTREE_CACHE"

@@ -15,8 +15,8 @@ from warp_abtree.app.cli.progress import Progress, compile_notice, start_warp
 from warp_abtree.app.pictures import command as picture_command
 from warp_abtree.app.viewer import command as view_command
 from warp_abtree.checks.kernel_loading import tell_loading
+from warp_abtree.checks.package import __version__
 from warp_abtree.checks.signals import handle_signals, not_swallowed
-from warp_abtree.checks.version import __version__
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -1,4 +1,7 @@
-"""Names that are imported when they are first asked for: a process takes the time of what it uses."""
+"""The package: its version, and names that are imported when first asked for, so that a process pays for what it uses.
+
+Nothing of Warp is imported here.
+"""
 
 import ast
 import functools
@@ -6,12 +9,15 @@ import gc
 import importlib
 import importlib.util
 
+__version__ = "0.2.0"
+
 
 @functools.cache
 def find_modules(source: str) -> dict:
-    """Return the module that each name comes from which a module imports by `from`, without importing any."""
+    """Return the module that each name comes from which a module imports by `from`; none is imported for that."""
     spec = importlib.util.find_spec(source)
-    text = spec.loader.get_source(source) if spec and hasattr(spec.loader, "get_source") else None
+    get_source = getattr(spec.loader, "get_source", None) if spec else None
+    text = get_source(source) if get_source else None
     imports = [node for node in ast.parse(text or "").body if isinstance(node, ast.ImportFrom)]
     return {alias.asname or alias.name: node.module for node in imports for alias in node.names}
 
