@@ -211,3 +211,25 @@ def test_lists_that_parts_replace_are_freed(device, regime, monkeypatch):
     assert query.parts is not None
     gc.collect()
     assert not any(array() is not None for array in old)
+
+
+@pytest.mark.parametrize("regime", ["warps"], indirect=True)
+def test_lists_of_parts_take_the_memory_of_those_before(device, monkeypatch, regime):
+    """Those go first, and come back where the device has no room for the parts."""
+    scene, _ = grid(device)
+    query, whole = ab.ManifoldQuery(scene, gap=GAP), ab.ManifoldQuery(scene, gap=GAP)
+    expected = bytes_of(whole.run())
+    shorten_lists(monkeypatch)
+    rooms, held, make = query.rooms, [], point_parts.PointParts
+
+    def refuse(*given):
+        held.append(query.rooms)
+        raise MemoryError("no room")
+
+    monkeypatch.setattr("warp_abtree.query.stages.points.PointParts", refuse)
+    with pytest.raises(MemoryError, match="no room"):
+        query.run()
+    assert query.parts is None and query.rooms == rooms and held == [rooms._replace(hits=1, uncertain=1)]
+    monkeypatch.setattr("warp_abtree.query.stages.points.PointParts", make)
+    assert bytes_of(query.run()) == expected and query.parts.count > 1
+    assert query.parts.operator.rooms.uncertain < whole.rooms.uncertain / 2

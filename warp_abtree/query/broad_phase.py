@@ -80,6 +80,14 @@ def count_others(group: np.ndarray, tile: int, shared_group: int) -> np.ndarray:
     return -(-end // tile) - np.arange(len(first))
 
 
+def count_possible(group: np.ndarray, shared_group: int) -> int:
+    """Return how many pairs there are at most of objects of one group, or of which one is of the shared group, -1 for
+    none."""
+    sizes = np.bincount(group)
+    shared = int(sizes[shared_group]) if shared_group >= 0 else 0
+    return int((sizes * (sizes - 1)).sum()) // 2 + shared * (len(group) - shared)
+
+
 def list_tasks(others: np.ndarray, most: int) -> np.ndarray:
     """Return what warps compare, int32 (t, 3): a tile, the first of the others, and how many, so many at most."""
     tasks = -(-others // most)
@@ -228,7 +236,7 @@ class BroadPhase(DeviceMemory):
         self._commands = Commands()
         self.search: TileSearch | SweepSearch
         self.search = (TileSearch if current_regime().uses_warps(device) else SweepSearch)(self, group)
-        self.resize(capacity or max(64, 4 * count))
+        self.resize(capacity or max(64, min(4 * count, count_possible(group, self.filter.shared_group))))
 
     def resize(self, capacity: int):
         """Make room for a number of pairs."""

@@ -63,7 +63,8 @@ class PointParts:
         self.count = min(pairs, max(-(-hits // HITS_AT_ONCE), -(-uncertain // UNCERTAIN_AT_ONCE)))
         # Half as many again as an even share: contacts are sorted, and looked at, as many as there is room for.
         hits = min(hits, HITS_AT_ONCE, -(-3 * hits // (2 * self.count)))
-        rooms = Buffers(hits, -(-query.rooms.pairs // self.count), min(uncertain, UNCERTAIN_AT_ONCE) or None)
+        uncertain = min(UNCERTAIN_AT_ONCE, -(-uncertain // self.count))  # what was asked has room to spare
+        rooms = Buffers(hits, -(-query.rooms.pairs // self.count), uncertain or None)
         self._gaps = next((stage for stage in stages if isinstance(stage, PartGaps)), None)
         self._points, self._lent = stages[-1], -1  # generation of the lists that the query has
         self._none = wp.empty(0, dtype=wp.float64, device=query.device)  # gaps where there are none
