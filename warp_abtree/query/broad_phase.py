@@ -236,7 +236,7 @@ class BroadPhase(DeviceMemory):
         self._commands = Commands()
         self.search: TileSearch | SweepSearch
         self.search = (TileSearch if current_regime().uses_warps(device) else SweepSearch)(self, group)
-        self.resize(capacity or max(64, min(4 * count, count_possible(group, self.filter.shared_group))))
+        self.resize(capacity or max(1, min(max(64, 4 * count), count_possible(group, self.filter.shared_group))))
 
     def resize(self, capacity: int):
         """Make room for a number of pairs."""
