@@ -6,7 +6,7 @@ python scenes/programs/arm_in_a_shelf.py draws one to arm_in_a_shelf.png (docs/p
 from pathlib import Path
 
 import numpy as np
-import trimesh
+from trimesh import creation
 
 import warp_abtree as ab
 from warp_abtree.app import picture
@@ -29,8 +29,9 @@ def load_arm(device):
 
 
 def make_shelf(device, rng):
-    scene, board = ab.Scene(device), ab.Model.load(trimesh.creation.box((0.4, 1.0, 0.02)))
-    models = [ab.Model.load(trimesh.creation.cylinder(0.035, 0.12)), ab.Model.load(trimesh.creation.icosphere(3, 0.05))]
+    meshes = creation.box((0.4, 1.0, 0.02)), creation.cylinder(0.035, 0.12), creation.icosphere(3, 0.05)
+    meshes[0].metadata["name"], meshes[1].metadata["name"], meshes[2].metadata["name"] = "board", "can", "ball"
+    scene, (board, *models) = ab.Scene(device), map(ab.Model.load, meshes)
     for k, height in enumerate((0.2, 0.6, 1.0)):
         scene.add(board, (0.75, 0, height, 0, 0, 0, 1), name=f"board {k}")
         for i, y in enumerate(np.linspace(-0.4, 0.4, 6) + rng.uniform(-0.04, 0.04, 6)):
@@ -41,7 +42,7 @@ def make_shelf(device, rng):
 
 def main(count=20_000, png="arm_in_a_shelf.png", device=None):
     rng, robot = np.random.default_rng(0), load_arm(device)
-    shelf, cup = make_shelf(device, rng), ab.Model.load(trimesh.creation.annulus(0.035, 0.04, 0.1))
+    shelf, cup = make_shelf(device, rng), ab.Model.load(creation.annulus(0.035, 0.04, 0.1))
     robot.attach(cup, "hand", (0, 0, 0.14, 0, 0.5**0.5, 0, 0.5**0.5), name="cup")
     configurations = rng.uniform(*robot.limits.T, (count, len(robot.joint_names)))
     free = configurations[~robot.check(configurations, shelf)]

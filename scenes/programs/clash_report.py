@@ -14,9 +14,9 @@ from warp_abtree.app import picture
 def write_assembly(path, rng):
     """Write a plate with bolts in its holes, a washer on each, and blocks between them; some are misplaced [mm]."""
     assembly = trimesh.Scene()
-    bore = trimesh.creation.annulus(3.3, 8, 12, sections=64)
-    parts = {"sleeve": bore, "bolt": trimesh.creation.cylinder(3.2, 30, sections=64)}
-    parts["washer"] = trimesh.creation.annulus(3.3, 7, 1.5, sections=64)
+    bore = trimesh.creation.annulus(3.3, 8, 12, sections=64, metadata={"name": "sleeve"})
+    parts = {"sleeve": bore, "bolt": trimesh.creation.cylinder(3.2, 30, sections=64, metadata={"name": "bolt"})}
+    parts["washer"] = trimesh.creation.annulus(3.3, 7, 1.5, sections=64, metadata={"name": "washer"})
     lift = {"sleeve": 0, "bolt": 5, "washer": 6.75}
     for k in range(16):
         for name, mesh in parts.items():
@@ -25,7 +25,9 @@ def write_assembly(path, rng):
             assembly.add_geometry(mesh, f"{name} {k}", transform=trimesh.transformations.translation_matrix(place))
     for k, x in enumerate((10, 51)):
         place = trimesh.transformations.translation_matrix((x, 30, 0))
-        assembly.add_geometry(trimesh.creation.box((3.5, 60, 8)), f"rail {k}", transform=place)
+        assembly.add_geometry(
+            trimesh.creation.box((3.5, 60, 8), metadata={"name": "rail"}), f"rail {k}", transform=place
+        )
     assembly.export(path)
 
 

@@ -19,11 +19,11 @@ def make_meshes():
         0.03, 0.006, transform=trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0))
     )
     body = [trimesh.creation.annulus(0.035, 0.04, 0.1), floor, handle.apply_translation((0.06, 0, 0))]
-    palm = trimesh.creation.box((0.14, 0.04, 0.03)).apply_translation((0, 0, -0.075))
+    palm = trimesh.creation.box((0.14, 0.04, 0.03), metadata={"name": "palm"}).apply_translation((0, 0, -0.075))
     return (
         trimesh.util.concatenate(body),
         palm,
-        trimesh.creation.box((THICK, 0.02, 0.06)).apply_translation((0, 0, -0.03)),
+        trimesh.creation.box((THICK, 0.02, 0.06), metadata={"name": "finger"}).apply_translation((0, 0, -0.03)),
     )
 
 

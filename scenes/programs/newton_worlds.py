@@ -15,8 +15,9 @@ def make_model(worlds, device):
     """Return a `newton.Model` of a floor and a peg that stand and a ring above in each world, and their meshes."""
     import newton
 
-    floor, peg = trimesh.creation.box((3, 3, 0.2)), trimesh.creation.cylinder(0.3, 1.5, sections=24)
-    meshes = [floor, peg, trimesh.creation.torus(0.8, 0.25, 32, 16)]
+    floor = trimesh.creation.box((3, 3, 0.2), metadata={"name": "floor"})
+    peg = trimesh.creation.cylinder(0.3, 1.5, sections=24, metadata={"name": "peg"})
+    meshes = [floor, peg, trimesh.creation.torus(0.8, 0.25, 32, 16, metadata={"name": "ring"})]
     shapes = [newton.Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces).ravel()) for mesh in meshes]
     scene, rng = newton.ModelBuilder(), np.random.default_rng(0)
     for _ in range(worlds):

@@ -39,8 +39,9 @@ class Swarm:
 
 
 def main(count=400, frames=240, budget_ms=8.0, png="own_loop.png", device=None):
-    knot = trimesh.creation.torus(0.5, 0.18, 128, 64)
-    models = [ab.Model.load(mesh) for mesh in (knot, trimesh.creation.icosphere(4, 0.5))]
+    ring, ball = trimesh.creation.torus(0.5, 0.18, 128, 64), trimesh.creation.icosphere(4, 0.5)
+    ring.metadata["name"], ball.metadata["name"] = "ring", "ball"
+    models = [ab.Model.load(ring), ab.Model.load(ball)]
     scene, swarm = ab.Scene(device), Swarm(count)
     scene.add_many([models[i % 2] for i in range(count)], swarm.poses(0.0, None))
     camera = ab.Camera.look_at((0, -1.2 * SIZE, 0.5 * SIZE), (0, 0, 0), (0, 0, 1))

@@ -121,6 +121,8 @@ def test_options_and_other_contents_build_anew(folder, built, ball):
     models = [ab.Model.from_arrays(mesh.vertices, mesh.faces, name="a"), ab.Model.load(mesh)]
     assert len(built) == 4 and models[0].digest == models[1].digest
     assert [model.name for model in models] == ["a", "trimesh"]
+    mesh.metadata["name"] = "ball"
+    assert ab.Model.load(mesh).name == "ball" and len(built) == 4
 
 
 def test_it_can_be_passed_by_or_not_be_written(folder, built, ball, monkeypatch):

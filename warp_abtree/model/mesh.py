@@ -45,7 +45,8 @@ def load_mesh(source, name=None):
             else that trimesh loads, gzipped (``.obj.gz``) or not, or to a zip archive of these; ``"warp:bunny"``,
             ``"warp:bear"`` or ``"warp:rocks"``, meshes inside Warp (these need the extra ``usd``); a trimesh.Trimesh;
             a trimesh.Scene, whose meshes are joined where its transforms put them.
-        name: Name for people; by default the file's, without its extensions.
+        name: Name for people; by default the file's, without its extensions, or the "name" of a trimesh object's
+            metadata.
 
     Polygons are cut into fans from their first corner, or by clipping ears where that fan would fold over; either way
     polygon by polygon in the source's order. A warning names what a file holds and is not read, such as lines, points,
@@ -58,7 +59,9 @@ def load_mesh(source, name=None):
         import trimesh  # takes as long as the rest of the library
 
         if isinstance(source, trimesh.parent.Geometry):
-            return _join_geometry(source, "trimesh" if name is None else name)
+            own = source.metadata.get("name")
+            own = own if isinstance(own, str) and own else "trimesh"
+            return _join_geometry(source, own if name is None else name)
         raise MeshError(f"cannot load a mesh from {type(source).__name__}; give a path, a trimesh.Trimesh or arrays")
     if isinstance(source, str) and source.startswith("warp:"):
         asset = source[len("warp:") :]
