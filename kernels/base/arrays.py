@@ -31,8 +31,11 @@ class ModelPool:
     split_face: wp.array(dtype=wp.int32)  # faces that each vertex split inserts or deforms, slice by slice
     leaf_node: wp.array(dtype=wp.int32)  # node of each face, the indexed list of the paper, shape [face]
     node_face: wp.array(dtype=wp.int32)  # face of a leaf, -1 at an inner node, -1 without a node, shape [node]
-    node_slab: wp.array(dtype=wp.vec4)  # `slab_overlap.NodeSlab` of nodes of few faces, shape [node], or [0]
-    slab_gain: wp.array(dtype=wp.vec2i)  # sum of `make_slabs.gain_of`, and its terms, shape [model]
+    node_slab: wp.array(dtype=wp.vec4)  # `slab_overlap.NodeSlab` of nodes of few faces, shape [2 node], or [0]: at the
+    # finest LOD, and behind these at one other LOD of each model
+    slab_gain: wp.array(dtype=wp.vec2i)  # sum of `make_slabs.gain_of`, and its terms, shape [2 model]
+    slab_first: wp.array(dtype=wp.int32)  # first node that has a slab, shape [2 model]
+    slab_lod: wp.array(dtype=wp.int32)  # the other LOD that has slabs, -1 for none, shape [model]
     face_start: wp.array(dtype=wp.int32)  # where its faces begin, shape [model]
     face_count: wp.array(dtype=wp.int32)  # shape [model]
     depth: wp.array(dtype=wp.int32)  # of its tree, shape [model]

@@ -27,7 +27,7 @@ ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
 # Of what brings small sizes to about 1.
 SCALE_MAX = wp.constant(wp.float64(2.0**100))
 HALF = wp.constant(wp.float64(0.5))
-# Nodes so few levels above the leaves have slabs: of 8 faces at most.
+# Nodes so few levels above the leaves have slabs: of 8 faces at most at the finest LOD, at others more levels.
 SLAB_DEPTH = wp.constant(3)
 NO_NODE = wp.constant(2**31 - 1)
 # Slabs separate little where boxes are hardly wider along their directions: by so many 64ths of the sum of widths.
@@ -130,13 +130,19 @@ def unit_scale(reach: wp.float64):
 
 
 @wp.func
-def has_node_slabs(trees: Trees, state: wp.int32):
-    """Return whether there are slabs of a state's nodes: of original faces, and where they gain."""
+def find_node_slabs(trees: Trees, state: wp.int32, within: wp.float64):
+    """Return where slabs of a state's nodes lie, at its LOD, and the first node that has one; NO_NODE where there are
+    none, or they gain little: at other LODs than the finest where nothing nearer than a distance is asked for."""
     model = trees.states.model[state]
-    if trees.models.node_slab.shape[0] == 0 or trees.states.lod[state] < trees.models.lod_max[model]:
-        return False
-    gain = trees.models.slab_gain[model]
-    return gain[0] > SLAB_GAIN_LEAST * gain[1]
+    start, entry, none = wp.int32(trees.models.node_start[model]), wp.int32(model), bool(False)
+    if trees.states.lod[state] != trees.models.lod_max[model]:
+        none = within == wp.float64(0.0) or trees.states.lod[state] != trees.models.slab_lod[model]
+        start += trees.models.node_slab.shape[0] / 2
+        entry += trees.models.depth.shape[0]
+    gain = trees.models.slab_gain[entry]
+    if none or trees.models.node_slab.shape[0] == 0 or gain[0] <= SLAB_GAIN_LEAST * gain[1]:
+        return wp.vec2i(start, NO_NODE)
+    return wp.vec2i(start, trees.models.slab_first[entry])
 
 
 @wp.func
@@ -147,7 +153,7 @@ def active_faces(trees: Trees, state: wp.int32):
 
 
 @wp.func
-def place_trees(trees: Trees, state_a: wp.int32, state_b: wp.int32):
+def place_trees(trees: Trees, state_a: wp.int32, state_b: wp.int32, within: wp.float64):
     """Return a `PairPose` with the places of the trees in the pool, and no more."""
     pose = PairPose()
     pose.node_a = trees.states.node_start[state_a]
@@ -156,12 +162,11 @@ def place_trees(trees: Trees, state_a: wp.int32, state_b: wp.int32):
     pose.corner_b = trees.states.face_start[state_b]
     pose.faces_a = active_faces(trees, state_a)
     pose.faces_b = active_faces(trees, state_b)
-    model_a, model_b = trees.states.model[state_a], trees.states.model[state_b]
-    pose.slab = wp.vec2i(trees.models.node_start[model_a], trees.models.node_start[model_b])
-    pose.floor = wp.vec2i(NO_NODE, NO_NODE)
-    if has_node_slabs(trees, state_a) and has_node_slabs(trees, state_b):
-        pose.floor[0] = 1 << wp.max(trees.models.depth[model_a] - SLAB_DEPTH, 0)
-        pose.floor[1] = 1 << wp.max(trees.models.depth[model_b] - SLAB_DEPTH, 0)
+    slabs_a, slabs_b = find_node_slabs(trees, state_a, within), find_node_slabs(trees, state_b, within)
+    pose.slab = wp.vec2i(slabs_a[0], slabs_b[0])
+    pose.floor = wp.vec2i(slabs_a[1], slabs_b[1])
+    if slabs_a[1] == NO_NODE or slabs_b[1] == NO_NODE:
+        pose.floor = wp.vec2i(NO_NODE, NO_NODE)
     return pose
 
 
@@ -195,7 +200,7 @@ def pair_pose(whole: bool, trees: Trees, a: wp.int32, b: wp.int32, within: wp.fl
     # Of a coordinate in `float32_filter_triangles`: docs/exactness.md, bound 1, whose terms need `near` below.
     off32 = UNIT_32 * (wp.float64(2.0) * reach_a + wp.float64(13.0) * reach_b + wp.float64(3.0) * far)
 
-    pose = place_trees(trees, state_a, state_b)
+    pose = place_trees(trees, state_a, state_b, within)
     pose.rotation = r
     pose.translation = t
     pose.within = within

@@ -4,40 +4,42 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
-from helpers.nested import touching_soups
+from helpers.nested import shells, touching_soups
 from helpers.questions import GpuQuery, launch
 from helpers.samples import sample
 from helpers.scenes import scene_with
 
+import warp_abtree as ab
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import Trees
 from warp_abtree.kernels.base.poses import SLAB_DEPTH, PairBatch
 from warp_abtree.kernels.search.item import pack_item
 from warp_abtree.kernels.search.slab_overlap import DIRECTION_LENGTH, slabs_overlap
+from warp_abtree.testing import regime
 
 wp.set_module_options(native.options())
 
 
-def read_slabs(device, model):
-    """Return directions, sums and sizes of a model's nodes that have slabs, and the first of these nodes."""
-    query = GpuQuery(scene_with(device, model, model), "any", pairs=[(0, 1)])
-    records = query.batch.models.pool.node_slab.numpy()
+def read_slabs(pool, model, entry=0):
+    """Return directions, sums and sizes of the nodes of a scene's first model, and the first that has a slab.
+
+    Args:
+        entry: 0 for the finest LOD, or how many models there are.
+    """
+    start = 0 if entry == 0 else len(pool.node_slab) // 2
+    records = pool.node_slab.numpy()[start : start + model.tree.node_count]
     low, high = records[:, 0].view(np.int32), records[:, 1].view(np.int32)
     directions = np.stack([low & 0xFFFF, (low >> 16) & 0xFFFF, high], 1) - int(DIRECTION_LENGTH)
-    return directions, records[:, 2], records[:, 3], 1 << max(0, model.tree.depth - int(SLAB_DEPTH))
+    return directions, records[:, 2], records[:, 3], int(pool.slab_first.numpy()[entry])
 
 
-@pytest.mark.parametrize("name", ["torus", "soup", "crumbs", "box"])
-def test_slabs_hold_their_faces(device, name):
-    """Of every node the exact extent along its direction, in fractions; and nodes of one face are as thin as it is."""
-    model = sample(name)
-    directions, sums, sizes, first = read_slabs(device, model)
-    leaf_node = model.tree.leaf_node
-    corner = (model.progressive.vertex_pos - model.centre)[model.progressive.face_vertex]
-    reach = np.abs(corner).max()
-    used = np.flatnonzero(model.tree.node_face[leaf_node] >= 0)[:200]
-    for face in used:
+def check_slabs(slabs, model, corner, faces):
+    """Check that slabs of all nodes above hold the corners of faces, (n_f, 3, 3), by exact extents along directions."""
+    directions, sums, sizes, first = slabs
+    leaf_node, reach = model.tree.leaf_node, np.abs(corner[faces]).max()
+    for face in faces[:200]:
         node = int(leaf_node[face])
         while node >= first:
             n = directions[node]
@@ -47,7 +49,55 @@ def test_slabs_hold_their_faces(device, name):
                 rounding = Fraction(float(reach)) * 2**-34  # of float64, which the margin covers
                 assert abs(along - Fraction(float(sums[node]))) <= Fraction(float(sizes[node])) + rounding
             node >>= 1
-    assert np.median(sizes[leaf_node[used]]) < 1e-3 * int(DIRECTION_LENGTH) * reach
+    return np.median(sizes[leaf_node[faces[:200]]]) / (int(DIRECTION_LENGTH) * reach)
+
+
+@pytest.mark.parametrize("name", ["torus", "soup", "crumbs", "box"])
+def test_slabs_hold_their_faces(device, name):
+    """Of every node the exact extent along its direction, in fractions; and nodes of one face are as thin as it is."""
+    model = sample(name)
+    query = GpuQuery(scene_with(device, model, model), "any", pairs=[(0, 1)])
+    slabs = read_slabs(query.batch.models.pool, model)
+    assert slabs[3] == 1 << max(0, model.tree.depth - int(SLAB_DEPTH))
+    corner = (model.progressive.vertex_pos - model.centre)[model.progressive.face_vertex]
+    used = np.flatnonzero(model.tree.node_face[model.tree.leaf_node] >= 0)
+    assert check_slabs(slabs, model, corner, used) < 1e-3
+
+
+def search_near(scene, gap):
+    """Return the bytes of contact points of the first two objects by warps, face pairs tested, and the models' pool."""
+    query = ab.ManifoldQuery(scene, [(0, 1)], gap=gap)
+    for _ in range(3):
+        found = query.run()
+    pool = query.batch.models.pool
+    return {name: part.tobytes() for name, part in found.points.items()}, int(found.triangle_tests[0]), pool
+
+
+def test_slabs_of_a_lod_that_stays(device):
+    """They hold the faces as they are there, leave points as they are, and serve no other LOD."""
+    gap, mesh = 0.01, trimesh.creation.torus(1.0, 0.4, 120, 60)
+    models = shells(np.random.default_rng(4), gap, mesh)
+    fine, coarse = ([model.lod_for(fraction=part) for model in models] for part in (0.6, 0.2))
+    scene, tests = scene_with(device, *models), []
+    with regime(warps=True):
+        for lods in (fine, coarse, fine):
+            scene.set_lods(lods)
+            points, tested, pool = search_near(scene, gap)
+            tests.append(tested)
+            assert pool.slab_lod.numpy().tolist() == lods and len(points["pair"]) > 0
+            with regime(slabs=False):
+                plain = scene_with(device, *models)
+                plain.set_lods(lods)
+                expected, plain_tests, _ = search_near(plain, gap)
+            assert points == expected and (tested < plain_tests or (lods is coarse and tested == plain_tests))
+            progressive = models[0].progressive
+            active = np.flatnonzero(progressive.face_split <= lods[0])
+            moved = progressive.vertex_pos[progressive.active_vertices(lods[0])[progressive.face_vertex]]
+            check_slabs(read_slabs(pool, models[0], 2), models[0], moved - models[0].centre, active)
+        assert tests[0] == tests[2]
+        scene.set_lods([fine[0], coarse[1]])  # the first search comes before slabs of these
+        ab.ManifoldQuery(scene, [(0, 1)], gap=gap).launch()
+        assert pool.slab_lod.numpy().tolist() == fine
 
 
 @wp.kernel

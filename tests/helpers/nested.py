@@ -12,10 +12,10 @@ from helpers.samples import STILL, mirrored, model_of_faces, random_poses, rando
 STEP = 2.0**-23  # of float32 from 1 to 2
 
 
-def shells(rng, gap):
+def shells(rng, gap, mesh=None):
     """Return two models of a rippled torus, the second farther inside by about a gap, which is random."""
-    model = sample("torus")
-    mesh = trimesh.Trimesh(*model.mesh_at(model.lod_max)[:2], process=False)
+    if mesh is None:
+        mesh = trimesh.Trimesh(*sample("torus").mesh_at(sample("torus").lod_max)[:2], process=False)
     rippled = mesh.vertices + 0.02 * np.sin(9 * mesh.vertices[:, [1, 2, 0]])
     inside = rippled - gap * rng.uniform(0.2, 1.8, (len(rippled), 1)) * mesh.vertex_normals
     return [ab.Model.from_arrays(points, mesh.faces) for points in (rippled, inside)]

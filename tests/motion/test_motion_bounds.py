@@ -54,7 +54,7 @@ def see_kernel(
 ):
     i = wp.tid()
     a, b = 2 * i, 2 * i + 1
-    pose = place_trees(trees, trees.objects.state[a], trees.objects.state[b])
+    pose = place_trees(trees, trees.objects.state[a], trees.objects.state[b], wp.float64(0.0))
     seen = Seen()
     motion = start_motion(paths, trees, wp.vec2i(a, b))
     seen.motion = bound_motion(motion, trees.states, pose, pair_skew(trees.objects, a, motion.first))
@@ -132,7 +132,7 @@ def straight_kernel(
 ):
     i = wp.tid()
     t, a, b, o = times[i], 2 * i, 2 * i + 1, wp.vec3()
-    pose = place_trees(trees, trees.objects.state[a], trees.objects.state[b])
+    pose = place_trees(trees, trees.objects.state[a], trees.objects.state[b], wp.float64(0.0))
     m = linear.start_linear_motion(ends, trees, wp.vec2i(a, b))
     m = linear.bound_linear_motion(m, trees.states, pose, pair_skew(trees.objects, a, m.first))
     speed = (m.way_b * m.centre_b + m.shift_b) - (m.way_a * m.centre_a + m.shift_a)

@@ -72,7 +72,7 @@ class Operator(DeviceMemory):
         with loading(self.device, operator_kernels(self.device, stages, output)):
             self.batch = batch = scene if isinstance(scene, Batch) else scene.batch()
             if self.uses_warps() and self.regime.slabs:
-                batch.models.make_slabs()
+                batch.make_slabs()
         if pairs is not None:
             self.given = batch.check_pairs(pairs)
         self._torn = False

@@ -43,7 +43,7 @@ class ModelArrays(DeviceMemory):
         self.face_count, self.node_count = np.diff(self.face_start), np.diff(self.node_start)
         self.depth = np.array([tree.depth for tree in trees], np.int64)
         self.lod_max = np.array([f.lod_max for f in forests], np.int64)
-        self._forests = forests
+        self._forests, self._slab_lods = forests, np.full(len(models), -1)  # the LOD beside the finest that has slabs
         self.size = np.array([np.ptp(f.vertex_pos[: f.vertex_count], axis=0).max() for f in forests])
         self.split_bounds = [f.split_start.astype(np.int64) + s for f, s in zip(forests, self.split_start)]
         first = self.vertex_start[:-1]
@@ -69,7 +69,9 @@ class ModelArrays(DeviceMemory):
             leaf_node=joined(tree.leaf_node for tree in trees),
             node_face=joined(tree.node_face for tree in trees),
             node_slab=np.empty((0, 4)),
-            slab_gain=np.zeros((len(models), 2)),
+            slab_gain=np.zeros((2 * len(models), 2)),
+            slab_first=np.tile(1 << np.maximum(0, self.depth - int(SLAB_DEPTH)), 2),
+            slab_lod=self._slab_lods,
             face_start=self.face_start[:-1],
             face_count=self.face_count,
             depth=self.depth,
@@ -84,16 +86,32 @@ class ModelArrays(DeviceMemory):
         """Certified errors of each model, as `ProgressiveMesh` has them."""
         return [f.lod_error for f in self._forests]
 
-    def make_slabs(self):
-        """Make slabs of nodes of few faces, for warps, unless there are any. Launches only."""
+    def make_slabs(self, trees):
+        """Make slabs of nodes of few faces at the finest LODs, for warps, unless there are any. Launches only."""
         if len(self.pool.node_slab):
             return
-        slabs = wp.empty(int(self.node_start[-1]), dtype=wp.vec4, device=self.device)
-        for model, depth in enumerate(self.depth):
-            first = 1 << max(0, int(depth) - int(SLAB_DEPTH))
-            inputs = [model, first, self.pool, slabs, self.pool.slab_gain]
-            wp.launch(make_slab_kernel, int(self.node_count[model]) - first, inputs, device=self.device)
+        slabs = wp.empty(2 * int(self.node_start[-1]), dtype=wp.vec4, device=self.device)
+        for model in range(len(self.depth)):
+            self._make_slabs(trees, model, -1, slabs)
         self.pool.node_slab = slabs
+
+    def make_lod_slabs(self, trees, model: int, state: int, lod: int):
+        """Make slabs of a model's nodes as they are in a tree state, at a LOD, in the place of those of another LOD.
+        Launches only."""
+        if self._slab_lods[model] != lod:
+            active = max(1, int(self._forests[model].active_count(lod)))
+            self._make_slabs(trees, model, state, self.pool.node_slab, int(self.face_count[model]) // active)
+            self._slab_lods[model] = lod
+
+    def _make_slabs(self, trees, model, state, slabs, coarser=1):
+        """Make slabs of nodes of some 8 faces at most, at an LOD with so many times fewer than the finest one has."""
+        pool, at = self.pool, model + (len(self.depth) if state >= 0 else 0)
+        first = 1 << max(0, int(self.depth[model]) - int(SLAB_DEPTH) - (coarser.bit_length() - 1))
+        start = int(self.node_start[model]) + (int(self.node_start[-1]) if state >= 0 else 0)
+        pool.slab_gain[at : at + 1].zero_()
+        pool.slab_first[at : at + 1].fill_(first)
+        inputs = [model, state, first, trees, start, at, slabs, pool.slab_gain, pool.slab_lod]
+        wp.launch(make_slab_kernel, int(self.node_count[model]) - first, inputs, device=self.device)
 
 
 @dataclass

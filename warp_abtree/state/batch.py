@@ -15,6 +15,9 @@ from warp_abtree.state.generation import Generation
 from warp_abtree.state.lod_update import LodUpdate, choose_states
 from warp_abtree.state.solids import SolidArrays
 
+# The search with a gap, since LODs have changed, before which slabs are made at these.
+SLAB_SEARCH = 2
+
 
 class Batch(DeviceMemory):
     """Objects of a device that queries are about, the tree states that they stand at, and their models.
@@ -53,6 +56,7 @@ class Batch(DeviceMemory):
         self.solids = SolidArrays(models, states, solid) if np.any(solid) else None
         self.retired = False
         self._trees, self._trees_made = Trees(), (-1, 0, 0)
+        self._slab_search = 0  # searches until slabs are made at the LODs as they stand, 0 where they need not be
 
     @property
     def lods(self) -> np.ndarray:
@@ -76,6 +80,26 @@ class Batch(DeviceMemory):
         self._lods, self.objects.state = lods, states.astype(np.int32)
         for state, lod in zip(states.tolist(), lods.tolist()):
             self.states.slots[state].lod = lod
+
+    def make_slabs(self):
+        """Make slabs of nodes of few faces, for warps, unless there are any. Launches only."""
+        self.models.make_slabs(self.trees)
+
+    def fit_slabs(self):
+        """Make slabs at the LOD of most objects of each model that are not at the finest one, once LODs have stood for
+        some searches. Launches only."""
+        if self._slab_search > 0 and len(self.models.pool.node_slab):
+            self._slab_search -= 1
+            if self._slab_search == 0:
+                self._make_lod_slabs()
+
+    def _make_lod_slabs(self):
+        for model, lod_max in enumerate(self.models.lod_max):
+            lods = self._lods[(self.object_model == model) & (self._lods < lod_max)]
+            if len(lods):
+                lod = int(np.bincount(lods).argmax())
+                at = next(i for i, slot in enumerate(self.states.slots) if (slot.model, slot.lod) == (model, lod))
+                self.models.make_lod_slabs(self.trees, model, at, lod)
 
     @property
     def object_count(self) -> int:
@@ -118,6 +142,8 @@ class Batch(DeviceMemory):
         self._lead()
         with self.states.change():
             stats = self._bring(lods)
+            if not np.array_equal(self._lods, lods):
+                self._slab_search = SLAB_SEARCH
             self._lods = np.array(lods)
         self._fit_solids()
         # The base mesh has a few faces, and each operation adds about as many as any other.

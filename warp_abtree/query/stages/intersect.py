@@ -88,6 +88,8 @@ class IntersectStage(HitStage):
 
     def search(self):
         """Traverse the pairs in place. Launches only."""
+        if self._with_gap and not self.operator.device.is_capturing:
+            self.operator.batch.fit_slabs()
         within = self.hits.gap if self._with_gap else self._no_distance
         within = within if self._resting is None else self._resting.asked
         slots = None
