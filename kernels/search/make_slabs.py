@@ -48,7 +48,7 @@ def corners_below(trees: Trees, model: wp.int32, state: wp.int32, node: wp.int32
 
 
 @wp.func
-def face_normal(models: ModelPool, corner: wp.vec3i):
+def normal_of_corners(models: ModelPool, corner: wp.vec3i):
     """Return the unit normal of a face, 0 where it has no area."""
     a = load_vertex(models.vertex_pos, corner[0])
     n = wp.cross(load_vertex(models.vertex_pos, corner[1]) - a, load_vertex(models.vertex_pos, corner[2]) - a)
@@ -151,7 +151,7 @@ def make_slab_kernel(
     for i in range(1 << level):
         corner = corners_below(trees, model, state, node, level, i)
         if corner[0] >= 0:
-            mean += face_normal(trees.models, corner)
+            mean += normal_of_corners(trees.models, corner)
             count += 1
     if count == 0:
         slab_out[start + node] = wp.vec4()
@@ -162,7 +162,7 @@ def make_slab_kernel(
     for i in range(1 << level):
         corner = corners_below(trees, model, state, node, level, i)
         if corner[0] >= 0:
-            normal = face_normal(trees.models, corner)
+            normal = normal_of_corners(trees.models, corner)
             extent = measure_faces(trees, model, state, node, level, whole_direction(normal))
             if extent.high - extent.low < best.high - best.low:
                 best = extent
