@@ -144,38 +144,68 @@ def moved_along(twist, centre):
     return motion
 
 
+def normals_by_feature(vertices, faces):
+    """Return what tells on which side of a mesh a point is, by its nearest feature: of each face its normal, the sums
+    of its edges' two, opposite its corners, and those of its corners by angle, (f, 7, 3).
+
+    Source: Baerentzen and Aanaes 2005, Signed distance computation using the angle weighted pseudonormal.
+    """
+    corners, others = vertices[faces], [(1, 2), (2, 0), (0, 1)]
+    sides = [corners[:, j] - corners[:, i] for i, j in others]
+    unit = [side / np.maximum(np.linalg.norm(side, axis=1), 1e-300)[:, None] for side in sides]
+    normal = np.cross(sides[2], -sides[1])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+    found = np.zeros((len(faces), 7, 3))
+    found[:, 0] = normal
+    edges = np.sort(faces[:, others], axis=2).reshape(-1, 2)
+    edge = np.unique(edges, axis=0, return_inverse=True)[1].reshape(-1, 3)
+    sums, at_corner = np.zeros((edge.max() + 1, 3)), np.zeros((len(vertices), 3))
+    for k in range(3):
+        i, j = others[k]
+        angle = np.arccos(np.clip(-(unit[i] * unit[j]).sum(1), -1, 1))
+        np.add.at(sums, edge[:, k], normal)
+        np.add.at(at_corner, faces[:, k], angle[:, None] * normal)
+    found[:, 1:4], found[:, 4:] = sums[edge], at_corner[faces]
+    return found
+
+
 class Side(NamedTuple):
     """A mesh at a LOD, which points lie inside, and the vertices of the other one that are near it."""
 
     model: ab.Model
     lod: int
-    normals: np.ndarray  # by face of the file, (f, 3)
+    corners: np.ndarray  # of its faces, by face of the file, (f, 3, 3)
+    normals: np.ndarray  # `normals_by_feature`, (f, 7, 3)
     vertices: np.ndarray  # (k, 3), at the start in its own frame
 
-    def heights(self, points):
-        """Return the distances of points, (n,), and how far they lie in front of their nearest faces; infinite beyond
-        three gaps."""
+    def distances(self, points):
+        """Return signed distances of points, (n,), infinite beyond three gaps."""
         found = ab.signed_distance(self.model, points, self.lod, signed=False, nearest=True, within=3 * GAP)
         distance, nearest, face = found
-        ahead = np.einsum("ij,ij->i", points - nearest, self.normals[face])
-        return distance, np.where(face < 0, np.inf, ahead)
+        a, b, c = np.moveaxis(self.corners[face] - nearest[:, None], 1, 0)
+        areas = np.stack([np.linalg.norm(np.cross(*pair), axis=1) for pair in ((b, c), (c, a), (a, b))], 1)
+        off = areas <= 1e-6 * areas.sum(1)[:, None]  # corners that the nearest point is opposite of
+        feature = np.where(
+            off.sum(1) == 2, 4 + np.argmin(off, axis=1), np.where(off.any(1), 1 + np.argmax(off, axis=1), 0)
+        )
+        behind = np.einsum("ij,ij->i", points - nearest, self.normals[face, feature]) < 0
+        return np.where(behind, -distance, distance)
 
     def depths(self, motions):
-        """Return how far the deepest vertex lies behind its nearest face after each motion of them [m].
+        """Return how deep the deepest vertex is after each motion of them [m], of those that were outside at the start,
+        or inside by a tenth of the gap at most.
 
-        Off an edge that may be said of a point outside. None can be deeper than it has moved beyond its distance at the
-        start.
+        Meshes that are not closed have no side everywhere: none can be deeper than it has moved beyond its distance at
+        the start.
         """
-        distance, height = self.heights(self.vertices)
-        outside = height > -GAP / 10
-        vertices, room = self.vertices[outside], np.copysign(distance, height)[outside]
-        found = []
+        start = self.distances(self.vertices)
+        outside = start > -GAP / 10
+        vertices, start, found = self.vertices[outside], start[outside], []
         for motion in motions:
             points = vertices @ motion[:3, :3].T + motion[:3, 3]
-            depth = -self.heights(points)[1]
-            deepest = np.linalg.norm(points - vertices, axis=1) - room
-            found.append(np.where(depth > deepest, 0.0, depth).max(initial=0.0))
-        return np.array(found) - max(0.0, -height[outside].min(initial=0.0))
+            depth, way = -self.distances(points), np.linalg.norm(points - vertices, axis=1)
+            found.append(np.where(depth > way - start + 1e-6 * GAP, 0.0, depth).max(initial=0.0))
+        return np.array(found) - max(0.0, -start.min(initial=0.0))
 
 
 def sides(parts, lods, pose):
@@ -183,13 +213,11 @@ def sides(parts, lods, pose):
     meshes = [part.mesh_at(lod) for part, lod in zip(parts, lods)]
     for k, matrix in enumerate((pose, np.linalg.inv(pose))):
         vertices, faces, face_ids = meshes[k]
-        a, b, c = (vertices[faces[:, i]] for i in range(3))
-        normals = np.zeros((face_ids.max() + 1, 3))
-        normals[face_ids] = np.cross(b - a, c - a)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+        corners, normals = np.zeros((face_ids.max() + 1, 3, 3)), np.zeros((face_ids.max() + 1, 7, 3))
+        corners[face_ids], normals[face_ids] = vertices[faces], normals_by_feature(vertices, faces)
         own = meshes[1 - k][0] @ matrix[:3, :3].T + matrix[:3, 3]
         near = np.isfinite(ab.signed_distance(parts[k], own, lods[k], signed=False, within=3 * GAP))
-        yield Side(parts[k], lods[k], normals, own[near])
+        yield Side(parts[k], lods[k], corners, normals, own[near])
 
 
 def push(parts, lods, poses, near, found, count) -> dict:

@@ -170,6 +170,23 @@ def test_depth_of_meshes_that_are_moved():
     assert points.push(parts, lods, [pose], near, found, 40)["really_um"] > 5
 
 
+def test_the_side_of_a_mesh_off_its_edges_and_corners():
+    """Of a prism over an L, by the normals of both faces at an edge, and of all at a corner."""
+    outline = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], float)
+    vertices = np.concatenate([np.c_[outline, np.zeros(6)], np.c_[outline, np.ones(6)]])
+    caps = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 5), (3, 4, 5)])
+    walls = [f for i in range(6) for j in [(i + 1) % 6] for f in ((i, j, j + 6), (i, j + 6, i + 6))]
+    model = ab.Model.from_arrays(vertices, np.concatenate([caps[:, ::-1], caps + 6, walls]))
+    cube = ab.Model.load(trimesh.creation.box((0.1, 0.1, 0.1)))
+    first, _ = points.sides([model, cube], [model.lod_max, cube.lod_max], np.eye(4))
+    x, y = 0.3 * points.GAP, 0.4 * points.GAP
+    near = [(1 - x, 1 - y, 0.5), (1 + x, 1 + y, 0.5), (2 + x, 1 + y, 0.5), (2 - y, 1 - x, 0.5), (1 - x, 1 - y, 1 + y)]
+    far = [-0.5, x / points.GAP, 0.5, -0.3, 0.4]
+    np.testing.assert_allclose(first.distances(np.array(near)), points.GAP * np.array(far), rtol=1e-6)
+    corner = np.array([(2 + x, 1 + y, 1 + x), (-x, -y, -x)])
+    np.testing.assert_allclose(first.distances(corner), np.hypot(0.5 * points.GAP, x), rtol=1e-6)
+
+
 def test_penetration_that_points_allow():
     """Four corners allow none; their middle alone lets a square tilt about it, none at all lets it through."""
     gap, square = 0.1, corners_at([0.02, 0.0, 0.05, 0.03])

@@ -11,6 +11,7 @@ from helpers.bodies import about, model_of
 
 import warp_abtree as ab
 from warp_abtree.query import point_parts
+from warp_abtree.query.operator import Operator
 
 GAP, SIDE = 0.06, 4
 BALL = model_of(trimesh.creation.icosphere(subdivisions=3, radius=0.52))
@@ -214,22 +215,13 @@ def test_lists_that_parts_replace_are_freed(device, regime, monkeypatch):
 
 
 @pytest.mark.parametrize("regime", ["warps"], indirect=True)
-def test_lists_of_parts_take_the_memory_of_those_before(device, monkeypatch, regime):
-    """Those go first, and come back where the device has no room for the parts."""
+def test_no_lists_for_all_pairs_come_before_those_of_parts(device, monkeypatch, regime):
+    """What a first search counts says that parts are needed, though its lists of face pairs that wait were short."""
     scene, _ = grid(device)
-    query, whole = ab.ManifoldQuery(scene, gap=GAP), ab.ManifoldQuery(scene, gap=GAP)
+    whole = ab.ManifoldQuery(scene, gap=GAP)
     expected = bytes_of(whole.run())
-    shorten_lists(monkeypatch)
-    rooms, held, make = query.rooms, [], point_parts.PointParts
-
-    def refuse(*given):
-        held.append(query.rooms)
-        raise MemoryError("no room")
-
-    monkeypatch.setattr("warp_abtree.query.stages.points.PointParts", refuse)
-    with pytest.raises(MemoryError, match="no room"):
-        query.run()
-    assert query.parts is None and query.rooms == rooms and held == [rooms._replace(hits=1, uncertain=1)]
-    monkeypatch.setattr("warp_abtree.query.stages.points.PointParts", make)
+    shorten_lists(monkeypatch, hits=1500, uncertain=10**9)
+    query, made = ab.ManifoldQuery(scene, None, ab.Buffers(100, None, 100), gap=GAP), []
+    monkeypatch.setattr(query, "make_room", lambda **rooms: (made.append(rooms), Operator.make_room(query, **rooms)))
     assert bytes_of(query.run()) == expected and query.parts.count > 1
-    assert query.parts.operator.rooms.uncertain < whole.rooms.uncertain / 2
+    assert made == [{"hits": 1, "uncertain": 1}]

@@ -234,7 +234,9 @@ def test_thousand_worlds(device):
     expected = np.argwhere(np.triu((worlds[:, None] == worlds) | (worlds[:, None] == -1) | (worlds == -1), 1))
     np.testing.assert_array_equal(scene.broad_phase(), expected)
     np.testing.assert_array_equal(sort_rows(scene.intersect().pairs), expected)
-    assert ab.Query(scene).rooms.pairs == len(expected), "no room for more pairs than worlds allow"
+    query = ab.Query(scene, "faces")
+    assert query.rooms.pairs == len(expected), "no room for more pairs than worlds allow"
+    assert query.rooms.hits == 16 * 4 * len(worlds), "but for as many hits as of objects in one world"
     apart = [(i, i + 1) for i in range(9) if worlds[i] != worlds[i + 1]]
     assert scene.intersect(apart).any.all(), "a pair that is asked for is tested whatever its worlds"
 

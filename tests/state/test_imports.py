@@ -4,7 +4,9 @@ import gc
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -66,3 +68,21 @@ def test_collections_of_garbage_go_on(tmp_path, monkeypatch):
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+def test_collections_go_on_after_several_threads(tmp_path, monkeypatch):
+    """One that begins while another one imports, and ends later."""
+    monkeypatch.syspath_prepend(tmp_path)
+    Path(tmp_path, "slow_module.py").write_text(
+        "import test_events\ntest_events.begun.set()\ntest_events.go.wait(30)\n"
+    )
+    events = SimpleNamespace(begun=threading.Event(), go=threading.Event())
+    monkeypatch.setitem(sys.modules, "test_events", events)
+    thread = threading.Thread(target=import_quickly, args=["slow_module"])
+    thread.start()
+    assert events.begun.wait(30) and not gc.isenabled()
+    import_quickly("json")
+    assert not gc.isenabled()
+    events.go.set()
+    thread.join()
+    assert gc.isenabled()

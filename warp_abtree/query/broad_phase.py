@@ -210,6 +210,7 @@ class BroadPhase(DeviceMemory):
         bounds: Boxes of the last launch, `kernels.intersect.broad_phase.PosedBounds`.
         lower, upper: Ends of these boxes, device vec3 (n,).
         pair_count: How many pairs were found, device int32 (1,); it keeps counting past the capacity.
+        usual_room: Pairs that so many objects mostly have room for, whether there may be as many or not.
         filter: Which objects may be a pair, `kernels.intersect.broad_phase.PairFilter`.
     """
 
@@ -236,7 +237,8 @@ class BroadPhase(DeviceMemory):
         self._commands = Commands()
         self.search: TileSearch | SweepSearch
         self.search = (TileSearch if current_regime().uses_warps(device) else SweepSearch)(self, group)
-        self.resize(capacity or max(1, min(max(64, 4 * count), count_possible(group, self.filter.shared_group))))
+        self.usual_room = max(64, 4 * count)
+        self.resize(capacity or max(1, min(self.usual_room, count_possible(group, self.filter.shared_group))))
 
     def resize(self, capacity: int):
         """Make room for a number of pairs."""

@@ -85,7 +85,8 @@ class Operator(DeviceMemory):
         places = self._find_places(room.pairs, sort_pairs)
         self.readout = Readout(self)
         uncertain = (room.uncertain or UNCERTAIN_ROOM) if self.uses_warps() else 0
-        hits = (room.hits or max(1024, 16 * places)) if output == "faces" else 0
+        usual = 0 if self.broad_phase is None or room.pairs else self.broad_phase.usual_room
+        hits = (room.hits or max(1024, 16 * max(places, usual))) if output == "faces" else 0
         self.rooms = Rooms()
         self.make_room(places, hits, uncertain)
 
@@ -389,7 +390,9 @@ class Operator(DeviceMemory):
     def _grow_uncertain(self, read, found: Found) -> Found:
         # How many wait varies for `any`, where the first hit of a pair ends its traversal.
         while 0 < self.list_rooms.uncertain < min(LIST_MAX, found.totals.uncertain):
-            self.make_list_room(uncertain=found.totals.uncertain)
+            # Most hits are known by now: lists that serve parts of the pairs are not made for all of them first.
+            hits = found.totals.hits if found.totals.hits > self.list_rooms.hits else None
+            self.make_list_room(hits=hits, uncertain=found.totals.uncertain)
             self.search()
             found = read()
         return found

@@ -315,14 +315,10 @@ class ManifoldQuery(Operator):
             gap = None if self.hits.gap is None else PartGaps()
             surfaces = None if self._originals is None else OriginalStage(self._originals.finest)
             stages = self._plan(gap, None if self.memory is None else gap, None, surfaces)
-            rooms = self.rooms
-            # Its own lists are not used any more; those of the parts may need their memory.
-            self.make_room(hits=1, uncertain=min(1, rooms.uncertain))
-            try:
-                self.parts = PointParts(self, stages, pairs, needed[0] or rooms.hits, needed[1] or rooms.uncertain)
-            except BaseException:
-                self.make_room(hits=rooms.hits, uncertain=rooms.uncertain)
-                raise
+            self.parts = PointParts(
+                self, stages, pairs, needed[0] or self.rooms.hits, needed[1] or self.rooms.uncertain
+            )
+            self.make_room(hits=1, uncertain=min(1, self.rooms.uncertain))  # its own are not used any more
         else:
             super().make_list_room(hits, uncertain)
             return
