@@ -170,21 +170,28 @@ def test_depth_of_meshes_that_are_moved():
     assert points.push(parts, lods, [pose], near, found, 40)["really_um"] > 5
 
 
-def test_the_side_of_a_mesh_off_its_edges_and_corners():
-    """Of a prism over an L, by the normals of both faces at an edge, and of all at a corner."""
-    outline = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], float)
-    vertices = np.concatenate([np.c_[outline, np.zeros(6)], np.c_[outline, np.ones(6)]])
-    caps = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 5), (3, 4, 5)])
-    walls = [f for i in range(6) for j in [(i + 1) % 6] for f in ((i, j, j + 6), (i, j + 6, i + 6))]
-    model = ab.Model.from_arrays(vertices, np.concatenate([caps[:, ::-1], caps + 6, walls]))
+def prism(outline, caps):
+    """Return a model over an outline, from 0 to 1, and the side of it that points near it lie on."""
+    n = len(outline)
+    vertices = np.concatenate([np.c_[outline, np.zeros(n)], np.c_[outline, np.ones(n)]])
+    walls = [f for i in range(n) for j in [(i + 1) % n] for f in ((i, j, j + n), (i, j + n, i + n))]
+    model = ab.Model.from_arrays(vertices, np.concatenate([np.array(caps)[:, ::-1], np.array(caps) + n, walls]))
     cube = ab.Model.load(trimesh.creation.box((0.1, 0.1, 0.1)))
-    first, _ = points.sides([model, cube], [model.lod_max, cube.lod_max], np.eye(4))
-    x, y = 0.3 * points.GAP, 0.4 * points.GAP
+    return next(iter(points.sides([model, cube], [model.lod_max, cube.lod_max], np.eye(4))))
+
+
+def test_the_side_of_a_mesh_off_its_edges_and_corners():
+    """By the normals of both faces at an edge, and of all at a corner: of an L, and off the sharp edge of a wedge."""
+    gap, x, y = points.GAP, 0.3 * points.GAP, 0.4 * points.GAP
+    ell = prism([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2.0)], [(0, 1, 2), (0, 2, 3), (0, 3, 5), (3, 4, 5)])
     near = [(1 - x, 1 - y, 0.5), (1 + x, 1 + y, 0.5), (2 + x, 1 + y, 0.5), (2 - y, 1 - x, 0.5), (1 - x, 1 - y, 1 + y)]
-    far = [-0.5, x / points.GAP, 0.5, -0.3, 0.4]
-    np.testing.assert_allclose(first.distances(np.array(near)), points.GAP * np.array(far), rtol=1e-6)
+    np.testing.assert_allclose(ell.distances(np.array(near)) / gap, [-0.5, 0.3, 0.5, -0.3, 0.4], rtol=1e-6)
     corner = np.array([(2 + x, 1 + y, 1 + x), (-x, -y, -x)])
-    np.testing.assert_allclose(first.distances(corner), np.hypot(0.5 * points.GAP, x), rtol=1e-6)
+    np.testing.assert_allclose(ell.distances(corner), np.hypot(0.5 * gap, x), rtol=1e-6)
+    # Behind one of both planes, but outside; and at the corner behind one of three.
+    wedge = prism([(0, 0), (2, 0), (2, 0.3)], [(0, 1, 2)])
+    off = np.array([(-0.5 * gap, way * gap, z) for way in (-0.2, 0.2) for z in (0.5, 1 + 0.1 * gap, -0.1 * gap)])
+    assert (wedge.distances(off) > 0.5 * gap).all()
 
 
 def test_penetration_that_points_allow():

@@ -78,12 +78,13 @@ def test_slabs_of_a_lod_that_stays(device):
     gap, mesh = 0.01, trimesh.creation.torus(1.0, 0.4, 120, 60)
     models = shells(np.random.default_rng(4), gap, mesh)
     fine, coarse = ([model.lod_for(fraction=part) for model in models] for part in (0.6, 0.2))
-    scene, tests = scene_with(device, *models), []
+    scene, tests, all_points = scene_with(device, *models), [], []
     with regime(warps=True):
         for lods in (fine, coarse, fine):
             scene.set_lods(lods)
             points, tested, pool = search_near(scene, gap)
             tests.append(tested)
+            all_points.append(points)
             assert pool.slab_lod.numpy().tolist() == lods and len(points["pair"]) > 0
             with regime(slabs=False):
                 plain = scene_with(device, *models)
@@ -95,9 +96,12 @@ def test_slabs_of_a_lod_that_stays(device):
             moved = progressive.vertex_pos[progressive.active_vertices(lods[0])[progressive.face_vertex]]
             check_slabs(read_slabs(pool, models[0], 2), models[0], moved - models[0].centre, active)
         assert tests[0] == tests[2]
-        scene.set_lods([fine[0], coarse[1]])  # the first search comes before slabs of these
-        ab.ManifoldQuery(scene, [(0, 1)], gap=gap).launch()
-        assert pool.slab_lod.numpy().tolist() == fine
+        query = ab.ManifoldQuery(scene, [(0, 1)], ab.Buffers(hits=2**17, uncertain=2**20), gap=gap)
+        for lods in (coarse, coarse, fine):
+            scene.set_lods(lods)
+            query.launch()
+        assert pool.slab_lod.numpy().tolist() == coarse, "the first search at an LOD comes before its slabs"
+        assert {name: part.tobytes() for name, part in query.result().points.items()} == all_points[0]
 
 
 @wp.kernel
