@@ -77,7 +77,7 @@ def test_slabs_of_a_lod_that_stays(device):
     """They hold the faces as they are there, leave points as they are, and serve no other LOD."""
     gap, mesh = 0.01, trimesh.creation.torus(1.0, 0.4, 120, 60)
     models = shells(np.random.default_rng(4), gap, mesh)
-    fine, coarse = ([model.lod_for(fraction=part) for model in models] for part in (0.6, 0.2))
+    fine, coarse = ([model.lod_for(fraction=part) for model in models] for part in (0.9, 0.6))
     scene, tests, all_points = scene_with(device, *models), [], []
     with regime(warps=True):
         for lods in (fine, coarse, fine):
@@ -90,7 +90,7 @@ def test_slabs_of_a_lod_that_stays(device):
                 plain = scene_with(device, *models)
                 plain.set_lods(lods)
                 expected, plain_tests, _ = search_near(plain, gap)
-            assert points == expected and (tested < plain_tests or (lods is coarse and tested == plain_tests))
+            assert points == expected and tested < plain_tests
             progressive = models[0].progressive
             active = np.flatnonzero(progressive.face_split <= lods[0])
             moved = progressive.vertex_pos[progressive.active_vertices(lods[0])[progressive.face_vertex]]
