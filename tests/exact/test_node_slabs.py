@@ -101,6 +101,24 @@ def test_slabs_of_a_lod_that_stays(device):
         assert query.result().contacts.tobytes() == contacts[0]
 
 
+def test_slabs_at_the_coarsest_lod_and_of_removed_objects(device):
+    """Slabs begin at most three levels above those of the finest LOD; who is left tells the LOD."""
+    model = sample("torus")
+    scene = scene_with(device, model, model, model)
+    with regime(warps=True):
+        scene.set_lods([0, 0, model.lod_max])
+        pool = search_near(scene, 0.02)[2]
+        assert pool.slab_lod.numpy().tolist() == [0]
+        assert pool.slab_first.numpy().tolist() == [1 << model.tree.depth - k for k in (SLAB_DEPTH, SLAB_DEPTH + 3)]
+        scene.remove([0, 1])
+        scene.add(model, lod=3)
+        scene.add(model, lod=3)
+        query = ab.ContactQuery(scene, scene.broad_phase()[-1:], gap=0.02)
+        for _ in range(3):
+            query.run()
+        assert query.batch.models.pool.slab_lod.numpy()[0] == 3
+
+
 @wp.kernel
 def compare_slabs_kernel(
     margin_factor: wp.float32,

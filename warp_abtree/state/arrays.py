@@ -19,6 +19,9 @@ SLOT_COLUMNS = ("model", "lod", "node_start", "face_start")
 SLOTS_LEAST = 16  # states that the pool has room for at first
 NO_CORNERS = wp.vec4i(-1, -1, -1, -1)  # of a face that is not active
 
+# Levels of nodes that have slabs at coarse LODs beyond those at the finest: one thread measures all faces of a node.
+MORE_LEVELS = 3
+
 
 class ModelArrays(DeviceMemory):
     """Static arrays of several models, concatenated on one device.
@@ -106,7 +109,8 @@ class ModelArrays(DeviceMemory):
     def _make_slabs(self, trees, model, state, slabs, coarser=1):
         """Make slabs of nodes of some 8 faces at most, at an LOD with so many times fewer than the finest one has."""
         pool, at = self.pool, model + (len(self.depth) if state >= 0 else 0)
-        first = 1 << max(0, int(self.depth[model]) - int(SLAB_DEPTH) - (coarser.bit_length() - 1))
+        levels = int(SLAB_DEPTH) + min(MORE_LEVELS, coarser.bit_length() - 1)
+        first = 1 << max(0, int(self.depth[model]) - levels)
         start = int(self.node_start[model]) + (int(self.node_start[-1]) if state >= 0 else 0)
         pool.slab_gain[at : at + 1].zero_()
         pool.slab_first[at : at + 1].fill_(first)

@@ -95,11 +95,13 @@ class Batch(DeviceMemory):
 
     def _make_lod_slabs(self):
         for model, lod_max in enumerate(self.models.lod_max):
-            lods = self._lods[(self.object_model == model) & (self._lods < lod_max)]
-            if len(lods):
-                lod = int(np.bincount(lods).argmax())
-                at = next(i for i, slot in enumerate(self.states.slots) if (slot.model, slot.lod) == (model, lod))
-                self.models.make_lod_slabs(self.trees, model, at, lod)
+            coarse = np.flatnonzero((self.object_model == model) & (self._lods < lod_max))
+            if len(coarse):
+                lod = int(np.bincount(self._lods[coarse]).argmax())
+                state = int(self.objects.state[coarse[np.argmax(self._lods[coarse] == lod)]])
+                slot = self.states.slots[state]
+                if (slot.model, slot.lod) == (model, lod):  # not of an object that was removed
+                    self.models.make_lod_slabs(self.trees, model, state, lod)
 
     @property
     def object_count(self) -> int:
